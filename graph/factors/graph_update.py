@@ -22,12 +22,13 @@ RelativePoseName = tuple[int, int, str]
 LOOP, MARGINAL, ANCHOR = "loop", "marginal", "bridge"
 """Kinds of relative poses: a closed loop; what stands for marginalised landmarks; a weak between
 factor that the smoother adds to hold a keyframe (called a bridge in saved graphs)."""
-ODOMETRY, GRAVITY, POSITION = "odometry", "gravity", "position"
+ODOMETRY, GRAVITY, POSITION, PLANAR = "odometry", "gravity", "position", "planar"
 """Kinds of relative poses that sensors measure."""
-PARTIAL = (GRAVITY, POSITION)
+PARTIAL = (GRAVITY, POSITION, PLANAR)
 """Kinds that fix a part of a pose only: what they do not measure has a very large sigma."""
-FIRST_FRAME = 1 << 40
-"""Reference frames (up is z) are poses of the graph with ids from here on, one a map segment."""
+FIRST_FRAME, FRAMES_OF_A_KIND = 1 << 40, 1 << 30
+"""Reference frames (up is z) are poses of the graph with ids from here on, one a map segment;
+planes of motion have ids that are by so much larger."""
 
 
 def _zeros(*shape: int) -> Array:
@@ -114,6 +115,11 @@ class RelativePose:
 def reference_frame_id(segment: int) -> int:
     """The id of a map segment's reference frame among the poses of the graph."""
     return FIRST_FRAME + segment
+
+
+def plane_id(segment: int) -> int:
+    """The id of the plane that a map segment's camera moves over, among the poses of the graph."""
+    return FIRST_FRAME + FRAMES_OF_A_KIND + segment
 
 
 @dataclass(frozen=True)

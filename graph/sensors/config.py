@@ -8,6 +8,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.sensors.accelerometer import AccelerometerConfig
 from bmask_slam.graph.sensors.imu import ImuConfig
 from bmask_slam.graph.sensors.odometry import OdometryConfig
+from bmask_slam.graph.sensors.planar import PlanarConfig
 from bmask_slam.graph.sensors.position import PositionConfig
 
 
@@ -23,6 +24,7 @@ class SensorsConfig:
     accelerometer: AccelerometerConfig = field(default_factory=AccelerometerConfig)
     position: PositionConfig = field(default_factory=PositionConfig)
     imu: ImuConfig = field(default_factory=ImuConfig)
+    planar: PlanarConfig = field(default_factory=PlanarConfig)
     late_s: float = 10.0
 
     @property

@@ -6,7 +6,7 @@ begins anew when positions align it for the first time, and is optimised with ev
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
@@ -96,33 +96,6 @@ class _Fixes:
     levers: Array = field(default_factory=lambda: np.zeros((0, 3)))
     antennas_world: Array = field(default_factory=lambda: np.zeros((0, 3)))
     rows: Array = field(default_factory=lambda: np.zeros((0, 5)))
-
-
-def carried_frames(
-    factors: Sequence[RelativePose], old: FactorTables, world: WorldMap
-) -> SensorChanges:
-    """Factors of another graph for a new one, with reference frames where their keyframes are now.
-
-    A frame whose segment is no more gets an id that no segment has.
-    """
-    segments = {k.segment for k in world.keyframes.values()}
-    keyframe_of = {f.keyframe_a: f.keyframe_b for f in factors if f.keyframe_a >= FIRST_FRAME}
-    free = max([RETIRED_FRAME, *(i + 1 for i in keyframe_of)])
-    ids, poses = {}, []
-    for frame, keyframe in sorted(keyframe_of.items()):
-        stays = frame >= RETIRED_FRAME or frame - FIRST_FRAME in segments
-        ids[frame] = frame if stays else free
-        free += not stays
-        T_old, T_frame = old.keyframes.get(np.array([keyframe, frame]))
-        poses.append(world.keyframes[keyframe].T_world_camera @ inverse(T_old) @ T_frame)
-    covariance = diagonal_covariance(SIGMA_RAD, SIGMA_M)
-    pairs = zip(ids.values(), poses, strict=True)
-    return SensorChanges(
-        np.array(list(ids.values()), np.int64),
-        np.array(poses).reshape(-1, 4, 4),
-        tuple(PosePrior(i, T, covariance) for i, T in pairs),
-        tuple(replace(f, keyframe_a=ids.get(f.keyframe_a, f.keyframe_a)) for f in factors),
-    )
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ the measurements. A keyframe that is culled leaves a gap that the next update cl
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Protocol
 
@@ -20,11 +21,15 @@ from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import (
     ANCHOR,
     FIRST_FRAME,
+    FRAMES_OF_A_KIND,
     GRAVITY,
     ODOMETRY,
+    PLANAR,
     POSITION,
+    PosePrior,
     RelativePose,
     RelativePoseName,
+    plane_id,
 )
 from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.files.array_file import nested, part
@@ -36,7 +41,15 @@ from bmask_slam.graph.sensors.odometry import Motion, motion_between
 from bmask_slam.graph.sensors.streams import COLUMNS, Measurements, SensorStreams
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.sensing.inertial_fusion import carried, inertial_update, motion_by_imu, newest_state
-from bmask_slam.sensing.reference_frame import Made, ReferenceFrame, SensorChanges, carried_frames
+from bmask_slam.sensing.planar_motion import planar_changes
+from bmask_slam.sensing.reference_frame import (
+    RETIRED_FRAME,
+    SIGMA_M,
+    SIGMA_RAD,
+    Made,
+    ReferenceFrame,
+    SensorChanges,
+)
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
@@ -44,7 +57,7 @@ MIN_SHARED = 15
 """A new keyframe that shares fewer landmarks with the one before is held to it weakly ..."""
 WEAK_COVARIANCE = diagonal_covariance(0.05, 0.1)
 """... as a keyframe that a removal left underconstrained."""
-DEGREES = {ODOMETRY: 6, GRAVITY: 2, POSITION: 3}
+DEGREES = {ODOMETRY: 6, GRAVITY: 2, POSITION: 3, PLANAR: 3}
 """The kinds of factors, and the degrees of freedom of their errors."""
 KINDS = tuple(DEGREES)
 FIT_PROBABILITY = 0.9999
@@ -139,7 +152,7 @@ class SensorFusion:
 
     def changes(self, owner: GraphOwner, last: bool = False) -> SensorChanges:
         """The factors that can be made now; ``last``: no further keyframe will come."""
-        if not self.streams:
+        if not (self.streams or self.config.planar.enabled):
             return SensorChanges()
         world, history, tables = owner.world, owner.history, owner.smoother.tables
         self._forget_culled(world)
@@ -151,6 +164,7 @@ class SensorFusion:
             moved = SensorChanges(relative_poses=tuple(self._odometry(present)))
             found = found.with_more(moved).with_more(frame.changes())
             found = found.with_more(self._inertial(present, tables))
+            found = found.with_more(planar_changes(present, tables, self._made, self.config.planar))
         return found
 
     def _inertial(self, keyframes: list[Keyframe], tables: FactorTables) -> SensorChanges:
@@ -233,6 +247,35 @@ class SensorFusion:
         self._plumbs = {
             i: Plumb(row[:3], row[3:12].reshape(3, 3), float(row[12])) for i, row in plumbs
         }
+
+
+def carried_frames(
+    factors: Sequence[RelativePose], old: FactorTables, world: WorldMap
+) -> SensorChanges:
+    """Factors of another graph for a new one, with reference frames where their keyframes are now.
+
+    A frame whose segment is no more gets an id that no segment has.
+    """
+    segments = {k.segment for k in world.keyframes.values()}
+    keyframe_of = {f.keyframe_a: f.keyframe_b for f in factors if f.keyframe_a >= FIRST_FRAME}
+    planes = plane_id(0)
+    free = max([RETIRED_FRAME, *(i + 1 for i in keyframe_of if i < planes)])
+    ids, poses = {}, []
+    for frame, keyframe in sorted(keyframe_of.items()):
+        segment = (frame - FIRST_FRAME) % FRAMES_OF_A_KIND
+        stays = segment in segments or RETIRED_FRAME <= frame < planes
+        ids[frame] = frame if stays else free
+        free += not stays
+        T_old, T_frame = old.keyframes.get(np.array([keyframe, frame]))
+        poses.append(world.keyframes[keyframe].T_world_camera @ inverse(T_old) @ T_frame)
+    covariance = diagonal_covariance(SIGMA_RAD, SIGMA_M)
+    pairs = zip(ids.values(), poses, strict=True)
+    return SensorChanges(
+        np.array(list(ids.values()), np.int64),
+        np.array(poses).reshape(-1, 4, 4),
+        tuple(PosePrior(i, T, covariance) for i, T in pairs),
+        tuple(replace(f, keyframe_a=ids.get(f.keyframe_a, f.keyframe_a)) for f in factors),
+    )
 
 
 def example_state() -> Arrays:

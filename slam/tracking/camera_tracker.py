@@ -158,7 +158,7 @@ class CameraTracker:
             return untracked(np.eye(4), features) if can_begin else lost(np.eye(4), features)
         tracked = self.track_in_map(features)
         waits = self.lost_frames <= self._relocalisation.patience_frames or not can_begin
-        if waits or tracked.status is TrackingStatus.DEAD_RECKONING:
+        if waits or tracked.status is not TrackingStatus.LOST:
             return tracked
         self.segment = 1 + max(k.segment for k in self._map.world.keyframes.values())
         self.reference = None

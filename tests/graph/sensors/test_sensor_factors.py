@@ -26,6 +26,7 @@ from bmask_slam.graph.sensors.accelerometer import (
 )
 from bmask_slam.graph.sensors.mounting import T_of
 from bmask_slam.graph.sensors.odometry import OdometryConfig, motion_between
+from bmask_slam.graph.sensors.planar import PlanarConfig, planar_factor
 from bmask_slam.graph.sensors.position import PositionConfig, align, position_factor
 from bmask_slam.graph.sensors.streams import (
     Measurements,
@@ -254,3 +255,26 @@ def test_the_files_of_the_present_folder_are_read_and_a_strange_one_names_the_wa
     np.testing.assert_array_equal(found.rows[:, :4], [[1.5, 1, 2, 3]])
     with pytest.raises(InputError, match=r"--set sensors\.odometry\.enabled=false"):
         read_folder(Path(), ("odometry", "position"))
+
+
+# --- planar motion -------------------------------------------------------------------------------
+
+
+def test_a_planar_factor_holds_height_and_tilt_of_the_base_and_nothing_else() -> None:
+    config = PlanarConfig(camera_in_base=MOUNTING, sigma_height_m=0.01, sigma_tilt_rad=0.02)
+    T_world_plane, T_base_camera = T_WORLD_REFERENCE, T_of(MOUNTING)
+    on_plane = se3_exp(np.array([0, 0, 1.1, 0, 0, 0])) @ make_pose(
+        np.eye(3), np.array([3.0, -2, 0])
+    )
+    guess = on_plane @ se3_exp(np.array([0.03, -0.02, 0, 0, 0, 0.02])) @ T_base_camera
+    factor = planar_factor((7, 3), guess, config)
+
+    def off(change: list[float]) -> float:
+        T_world_base = T_world_plane @ on_plane @ se3_exp(np.array(change))
+        return chi2(factor, T_world_plane, T_world_base @ T_base_camera)
+
+    assert off([0, 0, 0, 0, 0, 0]) < 0.01
+    assert off([0, 0, 1.5, 2.0, -3.0, 0]) < 0.01  # heading and place
+    assert off([0, 0, 0, 0, 0, 0.02]) == pytest.approx(4, rel=0.05)
+    assert off([0.04, 0, 0, 0, 0, 0]) == pytest.approx(4, rel=0.05)
+    assert off([0, -0.04, 0, 0, 0, 0]) == pytest.approx(4, rel=0.05)
