@@ -65,13 +65,13 @@ class _Notes:
 
 
 def read_landmark_graph(
-    path: Path, config: SmootherConfig | None = None
+    path: Path, config: SmootherConfig | None = None, repair: bool = False
 ) -> tuple[FactorTables, Camera]:
     """Read a graph with landmarks; of several connected components, those with a prior.
 
     Fixed keyframes get a very firm prior. Without any prior the largest component is read and its
     first keyframe gets the smoother's prior. Landmarks without an observation are left out, with a
-    warning, as are lines of other types.
+    warning, as are lines of other types. ``repair``: as ``graph.g2o.pose_graphs.read_g2o``.
 
     Raises:
         InputError: naming file and line, as ``graph.g2o.pose_graphs.read_g2o``; also cameras that
@@ -85,7 +85,7 @@ def read_landmark_graph(
     names = np.array(rows[VIEW].ids, np.int64)
     _add_vertices(tables, rows, names, notes.landmark_offset, path)
     tables.observations.add(_views(rows[VIEW], names, notes.landmark_offset, camera, path))
-    tables.add_pose_factors(_pose_factors(rows, notes, tables.keyframes.ids, path))
+    tables.add_pose_factors(_pose_factors(rows, notes, tables.keyframes.ids, path, repair))
     check_fixed(fixed, tables.keyframes.ids, path)
     fixed_poses = tables.keyframes.get(np.array(sorted(fixed), np.int64))
     priors = zip(sorted(fixed), fixed_poses, strict=True)
@@ -188,19 +188,19 @@ def _views(rows: Rows, names: Ints, offset: int, camera: Camera, path: Path) -> 
 
 
 def _pose_factors(
-    rows: dict[str, Rows], notes: _Notes, keyframe_ids: Ints, path: Path
+    rows: dict[str, Rows], notes: _Notes, keyframe_ids: Ints, path: Path, repair: bool
 ) -> list[RelativePose | PosePrior]:
     """Priors, then relative poses; without a comment edges between ids in a row are odometry."""
     factors: list[RelativePose | PosePrior] = []
     priors, edges = rows[PRIOR], rows[RELATIVE]
     names = np.array(priors.ids, np.int64).reshape(-1, 2)[:, 0]
     indices_of(names, priors.lines, keyframe_ids, path)
-    for k, T, covariance in zip(names.tolist(), *_measured(priors, path), strict=True):
+    for k, T, covariance in zip(names.tolist(), *_measured(priors, path, repair), strict=True):
         factors.append(PosePrior(k, T, covariance))
     pairs = pairs_of(edges, path)
     indices_of(pairs, edges.lines, keyframe_ids, path)
     for (a, b), line, T, covariance in zip(
-        pairs.tolist(), edges.lines, *_measured(edges, path), strict=True
+        pairs.tolist(), edges.lines, *_measured(edges, path, repair), strict=True
     ):
         usual = ("odometry" if abs(a - b) == 1 else "loop", None)
         kind, robust = notes.edges.get(line, usual)
@@ -208,10 +208,10 @@ def _pose_factors(
     return factors
 
 
-def _measured(rows: Rows, path: Path) -> tuple[Array, Array]:
+def _measured(rows: Rows, path: Path, repair: bool) -> tuple[Array, Array]:
     """Poses (M, 4, 4) and covariances (M, 6, 6) of edge lines."""
     numbers = np.array(rows.numbers).reshape(-1, 28)
-    information = information_matrices(numbers[:, 7:], rows.lines, path)
+    information = information_matrices(numbers[:, 7:], rows.lines, path, repair)
     covariances = np.linalg.inv(information)
     covariances = (covariances + covariances.swapaxes(1, 2)) / 2
     return poses_of_columns(numbers[:, :7]), covariances

@@ -20,6 +20,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number, is_whole
 from bmask_slam.graph.files.reading import read_lines
+from bmask_slam.graph.g2o.dialects import g2o_words
 from bmask_slam.graph.geometry import make_pose, quaternion_from_rotation, rotation_from_quaternion
 from bmask_slam.graph.pose_graph.pose_graph import planar_coordinates, planar_poses
 from bmask_slam.graph.trajectory import check_quaternion
@@ -27,6 +28,7 @@ from bmask_slam.graph.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
 
+LEAST = 1e-9  # eigenvalue of a repaired matrix, of its largest
 _ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])  # its own inverse
 
 
@@ -53,7 +55,7 @@ class Rows:
 def read_rows(
     path: Path, tags: dict[str, Tag], on_comment: Callable[[str, int], None] = lambda text, k: None
 ) -> tuple[dict[str, Rows], dict[int, int]]:
-    """Lines of the given tags, and line numbers of FIX by vertex id.
+    """Lines of the given tags, other dialects' among them, and line numbers of FIX by vertex id.
 
     Lines of other tags are left out, with one warning a tag. ``on_comment`` gets each comment line
     and its number.
@@ -68,11 +70,13 @@ def read_rows(
     fixed: dict[int, int] = {}
     unknown: Counter[str] = Counter()
     for number, line in read_lines(path, "give a graph in g2o format", comments=True):
-        words, where = line.split(), f"{path}:{number}"
-        tag = words[0]
-        if tag.startswith("#"):
+        where = f"{path}:{number}"
+        if line.startswith("#"):
             on_comment(line, number)
-        elif tag in tags:
+            continue
+        words = g2o_words(line.split(), where)
+        tag = words[0]
+        if tag in tags:
             ids, numbers = _row(words, tags[tag], where)
             rows[tag].ids.append(ids)
             rows[tag].numbers.append(numbers)
@@ -132,24 +136,48 @@ def indices_of(names: Ints, lines: list[int], ids: Ints, path: Path) -> Ints:
     return np.searchsorted(ids, names)
 
 
-def information_matrices(triangles: Array, lines: list[int], path: Path) -> Array:
+def information_matrices(
+    triangles: Array, lines: list[int], path: Path, repair: bool = False
+) -> Array:
     """Matrices (M, d, d) from upper triangles; of six columns, rotation first.
 
+    With ``repair`` those that are not positive definite become the nearest (Frobenius norm; Higham,
+    1988) whose eigenvalues are at least ``LEAST`` of the largest, with a warning.
+
     Raises:
-        InputError: one that is not positive definite.
+        InputError: there are some, and ``repair`` is false.
     """
     d = 3 if triangles.shape[1] == 6 else 6
     rows, columns = np.triu_indices(d)
     matrices = np.zeros((len(triangles), d, d))
     matrices[:, rows, columns] = matrices[:, columns, rows] = triangles
-    smallest = np.linalg.eigvalsh(matrices)[:, 0]
-    if (smallest <= 0).any():
-        k = int(np.argmax(smallest <= 0))
-        raise InputError(
-            f"{path}:{lines[k]}: an information matrix that is not positive definite "
-            f"(smallest eigenvalue {smallest[k]:.3g}); correct or remove the edge"
+    smallest, *_, largest = np.linalg.eigvalsh(matrices).T
+    wrong = np.flatnonzero(smallest <= 0)
+    if len(wrong):
+        some = ", ".join(f"{lines[k]} ({smallest[k]:.3g})" for k in wrong[:5])
+        what = f"{len(wrong)} of {len(lines)}"
+        where = f"in lines (smallest eigenvalue) {some}{', ...' if len(wrong) > 5 else ''}"
+        if not repair:
+            raise InputError(
+                f"{path}:{lines[wrong[0]]}: an information matrix that is not positive definite; "
+                f"{what} are not, {where}; correct them, or take the nearest ones by --repair"
+            )
+        logger.warning(
+            "%s: %s information matrices are not positive definite and were replaced by the "
+            "nearest ones that are, %s",
+            path,
+            what,
+            where,
         )
+        matrices[wrong] = _nearest_definite(matrices[wrong], float(np.median(largest)))
     return matrices if d == 3 else matrices[:, _ROTATION_FIRST[:, None], _ROTATION_FIRST]
+
+
+def _nearest_definite(matrices: Array, typical: float) -> Array:
+    """The nearest symmetric matrices (K, d, d) whose eigenvalues have the least that is allowed."""
+    values, vectors = np.linalg.eigh(matrices)
+    least = LEAST * np.maximum(values[:, -1:], max(typical, LEAST))
+    return np.asarray((vectors * np.maximum(values, least)[:, None]) @ np.swapaxes(vectors, 1, 2))
 
 
 def information_columns(information: Array) -> Array:

@@ -1,7 +1,7 @@
 """The g2o text format of pose graphs: VERTEX_SE2, EDGE_SE2, VERTEX_SE3:QUAT, EDGE_SE3:QUAT, FIX.
 
-The orders of their columns are in ``graph.g2o.lines``; graphs with landmarks in
-``graph.g2o.landmark_graphs``.
+The orders of their columns are in ``graph.g2o.lines``; other dialects in ``graph.g2o.dialects``;
+graphs with landmarks in ``graph.g2o.landmark_graphs``.
 """
 
 from __future__ import annotations
@@ -38,11 +38,12 @@ _TAGS = {
 }
 
 
-def read_g2o(path: Path) -> PoseGraph:
+def read_g2o(path: Path, repair: bool = False) -> PoseGraph:
     """Read a 2-D or 3-D pose graph; if it is not connected, its largest component.
 
-    Lines with other tags are left out, with one warning a tag. A file of edges alone gives a graph
-    with ``has_poses`` false.
+    Other dialects are read too (``graph.g2o.dialects``); lines with unknown tags are left out, with
+    one warning a tag. A file of edges alone gives a graph with ``has_poses`` false. ``repair``
+    replaces information matrices that are not positive definite by the nearest that are.
 
     Raises:
         InputError: naming file and line: a wrong number of columns, a value that is no finite
@@ -70,7 +71,7 @@ def read_g2o(path: Path) -> PoseGraph:
         poses=np.tile(np.eye(4), (len(ids), 1, 1)) if given is None else given,
         edges=edge_rows,
         measurements=poses_of_columns(numbers[:, :size]),
-        information=information_matrices(numbers[:, size:], edges.lines, path),
+        information=information_matrices(numbers[:, size:], edges.lines, path, repair),
         fixed=np.isin(ids, _known_fixed(fixed, ids, path, given is not None)),
         has_poses=given is not None,
     )

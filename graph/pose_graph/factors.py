@@ -1,44 +1,35 @@
-"""A pose graph in GTSAM's terms: factors, values, its cost, and the chordal initial value."""
+"""A pose graph in GTSAM's terms: factors and values; its residuals and cost without GTSAM."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import gtsam
 import numpy as np
 
 from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import inverse, make_pose, se3_log
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, planar_coordinates, planar_poses
 
-_IN_PLANE = np.array([3, 4, 2])  # positions of x, y and angle in a tangent of SE(3)
+_PLANAR = [3, 4, 2]  # x, y and angle in a tangent of SE(3)
+
+
+def edge_chi_squares(graph: PoseGraph, poses: Array | None = None) -> Array:
+    """(M,) ``r^T Omega r`` of all edges at poses (N, 4, 4), by default the graph's.
+
+    ``r = log(inverse(measurement) @ inverse(T_world_i) @ T_world_j)``, as GTSAM has it.
+    """
+    T = graph.poses if poses is None else poses
+    i, j = graph.edges.T
+    r = se3_log(inverse(T[i] @ graph.measurements) @ T[j])
+    if graph.is_planar:
+        r = r[:, _PLANAR]
+    return np.asarray(np.einsum("mi,mij,mj->m", r, graph.information, r, optimize=True))
 
 
 def pose_graph_cost(graph: PoseGraph) -> float:
     """Half the sum of squared, whitened residuals at the graph's poses."""
-    return float(make_factors(graph).error(make_values(graph, graph.poses)))
-
-
-def chordal_poses(graph: PoseGraph) -> Array:
-    """Poses (N, 4, 4) by chordal relaxation: rotations first, then all in one linear step.
-
-    Carlone et al., ICRA 2015, by GTSAM. A 2-D graph is solved as 3-D in the plane. The
-    first vertex that is fixed (or the first) keeps its pose.
-    """
-    anchor = int(np.argmax(graph.fixed))
-    information = graph.information
-    if graph.is_planar:
-        information = np.tile(np.eye(6), (len(graph.edges), 1, 1))
-        information[:, _IN_PLANE[:, None], _IN_PLANE] = graph.information
-    spatial = replace(graph, information=information)
-    factors = make_factors(spatial)
-    factors.add(
-        gtsam.PriorFactorPose3(
-            anchor, gtsam.Pose3(graph.poses[anchor]), gtsam.noiseModel.Unit.Create(6)
-        )
-    )
-    poses = poses_of(spatial, gtsam.InitializePose3.initialize(factors))
-    return planar_poses(planar_coordinates(poses)) if graph.is_planar else poses
+    return 0.5 * float(edge_chi_squares(graph).sum())
 
 
 def make_factors(graph: PoseGraph, information: Array | None = None) -> gtsam.NonlinearFactorGraph:
@@ -47,8 +38,12 @@ def make_factors(graph: PoseGraph, information: Array | None = None) -> gtsam.No
     between = gtsam.BetweenFactorPose2 if graph.is_planar else gtsam.BetweenFactorPose3
     factors = gtsam.NonlinearFactorGraph()
     measurements = _gtsam_poses(graph, graph.measurements)
+    noises: dict[bytes, Any] = {}  # most files have few different ones
     for (i, j), T, omega in zip(graph.edges.tolist(), measurements, information, strict=True):
-        factors.add(between(i, j, T, gtsam.noiseModel.Gaussian.Information(omega)))
+        noise = noises.get(key := omega.tobytes())
+        if noise is None:
+            noise = noises[key] = gtsam.noiseModel.Gaussian.Information(omega)
+        factors.add(between(i, j, T, noise))
     return factors
 
 
@@ -67,7 +62,8 @@ def make_gauge(graph: PoseGraph) -> gtsam.NonlinearFactorGraph:
 def _gtsam_poses(graph: PoseGraph, T: Array) -> list[Any]:
     if graph.is_planar:
         return [gtsam.Pose2(x, y, angle) for x, y, angle in planar_coordinates(T).tolist()]
-    return [gtsam.Pose3(pose) for pose in T]
+    rotations = T[:, :3, :3].reshape(-1, 9).tolist()
+    return [gtsam.Pose3(gtsam.Rot3(*R), t) for R, t in zip(rotations, T[:, :3, 3], strict=True)]
 
 
 def make_values(graph: PoseGraph, poses: Array) -> gtsam.Values:
@@ -79,8 +75,7 @@ def make_values(graph: PoseGraph, poses: Array) -> gtsam.Values:
 
 def poses_of(graph: PoseGraph, values: gtsam.Values) -> Array:
     """(N, 4, 4) from values."""
-    count = range(len(graph.ids))
-    if not graph.is_planar:
-        return np.stack([values.atPose3(k).matrix() for k in count])
-    coordinates = [(p.x(), p.y(), p.theta()) for p in map(values.atPose2, count)]
-    return planar_poses(np.array(coordinates))
+    if graph.is_planar:
+        return planar_poses(np.asarray(gtsam.utilities.extractPose2(values)))
+    rows = np.asarray(gtsam.utilities.extractPose3(values))  # R row by row, then t
+    return make_pose(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:])

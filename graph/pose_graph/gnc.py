@@ -53,7 +53,7 @@ def find_wrong_loops(
             break
         new_cost = search.solve(tried)
         if new_cost >= cost * (1 - config.relative_tolerance):
-            solver.start_from(poses)
+            solver.poses = poses
             break
         right, cost = tried, new_cost
     return ~right

@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.batch.iteration import Progress
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.pose_graph.factors import chordal_poses, pose_graph_cost
+from bmask_slam.graph.pose_graph.chordal import chordal_poses
+from bmask_slam.graph.pose_graph.factors import edge_chi_squares
 from bmask_slam.graph.pose_graph.gnc import find_wrong_loops
 from bmask_slam.graph.pose_graph.loop_consistency import loop_consistency
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, spanning_tree_poses
-from bmask_slam.graph.pose_graph.solver import Method, PoseGraphConfig, PoseGraphSolver
+from bmask_slam.graph.pose_graph.solver import Descent, Method, PoseGraphConfig, PoseGraphSolver
+
+RACE_STEPS = 3
 
 __all__ = ["Method", "PoseGraphConfig", "PoseGraphResult", "optimise_pose_graph"]
 
@@ -83,38 +87,43 @@ def _optimise(
             trusted = loops.consistent | graph.is_odometry
     given = "file" if graph.has_poses else "odometry"
     given_poses = graph.poses if graph.has_poses else spanning_tree_poses(graph)
-    start, poses = _best_start(graph, {given: given_poses}, trusted)
-    solver.start_from(poses)
+    solver.weigh(trusted.astype(float))
+    starts = {"chordal": chordal_poses(graph.with_edges(trusted)), given: given_poses}
+    chi_squares = {name: edge_chi_squares(graph, poses) for name, poses in starts.items()}
+    costs = {name: 0.5 * float(c[trusted].sum()) for name, c in chi_squares.items()}
+    start, raced = _best_start(solver, starts, costs)
     if loops is not None:
         is_outlier = find_wrong_loops(graph, solver, config, loops)
-    solver.weigh(np.where(is_outlier, 0.0, 1.0))
-    final_cost = solver.run(config.max_iterations)
+        solver.weigh(np.where(is_outlier, 0.0, 1.0))
+        raced = None
+    final = solver.run(config.max_iterations, raced)
     return PoseGraphResult(
         graph=graph.with_poses(solver.poses),
         method=config.method,
         given=given,
         given_poses=given_poses,
-        given_cost=solver.cost(given_poses),
+        given_cost=0.5 * float(chi_squares[given].sum()),
         start=start,
-        initial_cost=solver.cost(poses),
-        final_cost=final_cost,
+        initial_cost=0.5 * float(chi_squares[start].sum()),
+        final_cost=final.cost,
         iterations=solver.iterations,
         is_outlier=is_outlier,
     )
 
 
-# --- initial value -------------------------------------------------------------------------------
+def _best_start(
+    solver: PoseGraphSolver, starts: dict[str, Array], costs: dict[str, float]
+) -> tuple[str, Descent]:
+    """The start whose cost is lowest after a few steps, and these; the solver is left there.
 
-
-def _best_start(graph: PoseGraph, given: dict[str, Array], trusted: Mask) -> tuple[str, Array]:
-    """Name and poses of the cheapest initial value, judged by the trusted edges (M,) alone.
-
-    If several vertices are fixed, the given poses: the chordal solution fixes only one.
+    A low initial cost says little: odometry has none but in its loops, and ends in a local minimum.
+    A start that has converged below the initial costs of the others is not raced against them.
     """
-    if graph.fixed.sum() > 1:
-        return next(iter(given.items()))
-    judged = graph.with_edges(trusted)
-    candidates = {**given, "chordal": chordal_poses(judged)}
-    costs = {name: pose_graph_cost(judged.with_poses(T)) for name, T in candidates.items()}
-    name = min(costs, key=lambda key: costs[key])
-    return name, candidates[name]
+    race: list[tuple[str, Descent, Any]] = []
+    for name in sorted(starts, key=lambda name: costs[name]):
+        if race and race[0][1].is_nearly_converged and race[0][1].cost <= costs[name]:
+            break
+        solver.poses = starts[name]
+        race.append((name, solver.run(RACE_STEPS), solver.values))
+    name, descent, solver.values = min(race, key=lambda entry: entry[1].cost)
+    return name, descent

@@ -56,7 +56,7 @@ def compare(
     if not isinstance(experiment, Experiment):
         experiment = read_experiment(experiment)
     experiment = select_part(experiment, options)
-    with _locked(Path(out).absolute()) as folder, _pool(options) as pool:
+    with _locked(Path(out).absolute()) as folder, job_pool(options.workers, options.ray) as pool:
         plan = make_plan(experiment, folder, options)
         origin = provenance(experiment, pool.workers)
         cells: Cells = {key: _pending(plan, key) for key in plan.cells()}
@@ -75,8 +75,9 @@ def compare(
         return comparison
 
 
-def _pool(options: CompareOptions) -> LocalPool | RayPool:
-    return RayPool(options.ray) if options.ray else LocalPool(options.workers)
+def job_pool(workers: int | None, ray: str | None) -> LocalPool | RayPool:
+    """So many workers of this machine, or the Ray cluster of an address."""
+    return RayPool(ray) if ray else LocalPool(workers)
 
 
 def _run_missing(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.g2o.landmark_graphs import write_landmark_graph
 from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
 from bmask_slam.graph.g2o.pose_graphs import read_g2o, write_g2o
+from bmask_slam.graph.pose_graph.certificate import Certificate, certify
 from bmask_slam.graph.pose_graph.optimisation import (
     Method,
     PoseGraphConfig,
@@ -29,37 +31,66 @@ from bmask_slam.refinement.adjustment_plot import (
 )
 
 
+@dataclass(frozen=True)
+class GraphOptions:
+    """How a pose graph is optimised.
+
+    Attributes:
+        repair: take the nearest positive definite information matrices where a file's are not.
+        certify: say whether the optimum is the global one, by Shonan averaging; 3-D only.
+        plot: the picture before and after.
+    """
+
+    method: Method = "lm"
+    repair: bool = False
+    certify: bool = False
+    plot: Path | None = None
+
+
 def optimise_file(
     file: Path,
     out: Path,
-    method: Method = "lm",
-    plot: Path | None = None,
+    options: GraphOptions | None = None,
     progress: Progress = lambda iteration, cost: None,
-) -> PoseGraphResult:
+) -> tuple[PoseGraphResult, Certificate | None]:
     """Optimise a g2o file and write the graph, without its outlier edges, to ``out``.
+
+    If certified rotations lead to a lower cost, that solution is the result.
 
     Raises:
         InputError: the output's folder is not there, the type of the picture is not known, or
             ``read_g2o`` or the solver refuses the file.
     """
+    options = options or GraphOptions()
     _check_output(out)
-    if plot is not None:
-        check_picture(plot)
-    graph = read_g2o(file)
+    if options.plot is not None:
+        check_picture(options.plot)
+    graph, certificate = read_g2o(file, options.repair), None
     try:
-        result = optimise_pose_graph(graph, PoseGraphConfig(method=method), progress)
+        result = optimise_pose_graph(graph, PoseGraphConfig(method=options.method), progress)
+        if options.certify:
+            certificate = certify(result)
+            result = _better(result, certificate)
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
     write_g2o(out, result.graph.with_edges(~result.is_outlier))
-    if plot is not None:
-        _draw(result, plot)
-    return result
+    if options.plot is not None:
+        _draw(result, options.plot)
+    return result, certificate
+
+
+def _better(result: PoseGraphResult, certificate: Certificate) -> PoseGraphResult:
+    if certificate.status != "not global" or certificate.poses is None:
+        return result
+    graph = result.graph.with_poses(certificate.poses)
+    return replace(result, graph=graph, final_cost=certificate.cost)
 
 
 def adjust_file(
     file: Path,
     out: Path,
     plot: Path | None = None,
+    repair: bool = False,
     progress: Progress = lambda iteration, cost: None,
 ) -> tuple[Adjustment, GraphSnapshot]:
     """Adjust the graph with landmarks of a g2o file and write it, without outliers, to ``out``.
@@ -70,7 +101,7 @@ def adjust_file(
     _check_output(out)
     if plot is not None:
         check_picture(plot)
-    tables, camera = read_landmark_graph(file)
+    tables, camera = read_landmark_graph(file, repair=repair)
     before = GraphSnapshot.of(tables)
     try:
         adjustment = adjust(tables, camera, progress=progress)
@@ -91,8 +122,8 @@ def _check_output(out: Path) -> None:
         raise InputError(f"{out}: a folder; give the name of a file to write")
 
 
-def format_result(result: PoseGraphResult) -> str:
-    """A few lines: the graph, the initial value, costs and outliers."""
+def format_result(result: PoseGraphResult, certificate: Certificate | None = None) -> str:
+    """A few lines: the graph, the initial value, costs, outliers, and the certificate."""
     graph = result.graph
     rows = [
         ("vertices", f"{len(graph.ids)} ({'2-D' if graph.is_planar else '3-D'})"),
@@ -107,7 +138,20 @@ def format_result(result: PoseGraphResult) -> str:
     ]
     if result.method == "gnc":
         rows.insert(7, ("outliers", f"{result.is_outlier.sum()} edges, left out of the output"))
+    if certificate is not None:
+        rows.append(("certificate", _describe(certificate)))
     return "\n".join(f"{name:15}{value}" for name, value in rows)
+
+
+def _describe(certificate: Certificate) -> str:
+    if certificate.poses is None:
+        return "undecided: no rotations could be certified"
+    text = {
+        "global": "global optimum: certified rotations lead to the same cost",
+        "not global": "was a local optimum: certified rotations lead to this lower cost",
+        "undecided": f"undecided: certified rotations lead to the cost {certificate.cost:.6g}",
+    }[certificate.status]
+    return f"{text} (smallest eigenvalue {certificate.smallest_eigenvalue:.2g})"
 
 
 def _draw(result: PoseGraphResult, path: Path) -> None:

@@ -101,6 +101,57 @@ def test_edges_without_vertices_give_a_graph_without_poses(tmp_path: Path) -> No
     assert not graph.has_poses
 
 
+def test_information_that_is_not_definite_is_counted_and_mended(tmp_path: Path, caplog) -> None:
+    """xx and yy keep their 11 and 22, the angle's -5 becomes almost nothing."""
+    bad = "EDGE_SE2 3 7 1 2 0.5 11 0 0 22 0 -5\n"
+    text = VERTICES_2D + EDGE_2D.replace("33", "99") + 7 * bad
+    with pytest.raises(
+        InputError, match=r":4: .* 7 of 8 are not, .* 4 \(-5\), 5 .* 8 \(-5\), \.\.\.; "
+    ):
+        read_text(tmp_path, text)
+    graph = read_g2o(tmp_path / "a.g2o", repair=True)
+    assert "7 of 8 information matrices are not positive definite and were replaced" in caplog.text
+    np.testing.assert_allclose(graph.information[1], np.diag([11, 22, 22e-9]), atol=1e-12)
+    np.testing.assert_array_equal(np.diag(graph.information[0]), [11, 22, 99])
+
+
+DIALECTS = {
+    "TORO 2-D": (
+        "VERTEX2 3 1 2 3\nVERTEX2 7 4 5 -0.5\nEDGE2 3 7 1 2 0.5 11 12 22 33 13 23\n",
+        VERTICES_2D + EDGE_2D,
+    ),
+    "rows": (
+        "ODOMETRY 3 7 1 2 0.5 11 0 0 22 0 33\n",
+        "EDGE_SE2 3 7 1 2 0.5 11 0 0 22 0 33\n",
+    ),
+    "no information": ("EDGE2 3 7 1 2 0.5\n", "EDGE_SE2 3 7 1 2 0.5 1 0 0 1 0 1\n"),
+    "quaternions": (
+        VERTICES_3D.replace("_SE3:QUAT", "3") + EDGE_3D.replace("_SE3:QUAT", "3"),
+        VERTICES_3D + EDGE_3D,
+    ),
+    "mixed": (VERTICES_3D.replace("_SE3:QUAT", "3") + EDGE_3D, VERTICES_3D + EDGE_3D),
+}
+
+
+@pytest.mark.parametrize(("text", "same"), DIALECTS.values(), ids=DIALECTS.keys())
+def test_other_dialects_are_the_same_graph(tmp_path: Path, text: str, same: str) -> None:
+    found = read_text(tmp_path, text)
+    expected = read_text(tmp_path, same)
+    for name in ("ids", "poses", "edges", "measurements", "information"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-12)
+
+
+def test_angles_are_those_of_gtsam(tmp_path: Path) -> None:
+    text = "VERTEX3 0 0 0 0 0 0 0\nVERTEX3 1 1 2 3 0.3 -0.5 1.1\nEDGE3 0 1 1 2 3 0.3 -0.5 1.1\n"
+    graph = read_text(tmp_path, text)
+    R = gtsam.Rot3.Ypr(1.1, -0.5, 0.3).matrix()
+    np.testing.assert_allclose(graph.measurements[0], make_pose(R, np.array([1.0, 2, 3])))
+    np.testing.assert_allclose(graph.poses[1], graph.measurements[0])
+    np.testing.assert_array_equal(graph.information[0], np.eye(6))
+    with pytest.raises(InputError, match=":1: 5 values after EDGE3"):
+        read_text(tmp_path, "EDGE3 0 1 1 2 3\n")
+
+
 GOOD_2D = "EDGE_SE2 3 7 1 2 0.5 1 0 0 1 0 1\n"
 BAD = {
     "6 columns": (

@@ -7,14 +7,18 @@ import pytest
 from pose_graph_rings import PER_LAP, ring
 from repository import SHARED
 
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.gnc import truncated_weights
 from bmask_slam.graph.g2o.pose_graphs import read_g2o
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
-from bmask_slam.graph.pose_graph.factors import chordal_poses, pose_graph_cost
+from bmask_slam.graph.pose_graph.certificate import certify
+from bmask_slam.graph.pose_graph.chordal import chordal_poses
+from bmask_slam.graph.pose_graph.factors import pose_graph_cost
 from bmask_slam.graph.pose_graph.loop_consistency import loop_consistency
 from bmask_slam.graph.pose_graph.loop_prediction import predicted_chi2
 from bmask_slam.graph.pose_graph.optimisation import PoseGraphConfig, optimise_pose_graph
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, planar_poses, spanning_tree_poses
+from bmask_slam.graph.pose_graph.solver import PoseGraphSolver
 
 FOLDER = SHARED / "posegraphs"
 BOTH = pytest.mark.parametrize("planar", [True, False], ids=["2-D", "3-D"])
@@ -132,6 +136,40 @@ def test_bad_poses_in_the_file_are_replaced_by_chordal_ones() -> None:
     good = optimise_pose_graph(result.graph)
     assert good.start == "file"
     assert good.final_cost == pytest.approx(result.final_cost, rel=1e-6)
+
+
+def twisted(turns: int) -> PoseGraph:
+    """A planar ring of exact steps in 3-D, its poses wound round so many more times."""
+    truth = ring(24, False)
+    count = len(truth.ids)
+    closed = np.stack([np.arange(count), np.roll(np.arange(count), -1)], axis=1)
+    step = se3_exp(np.array([0, 0, 2 * np.pi / count, 1.0, 0, 0]))
+    wound = se3_exp(np.array([0, 0, 2 * np.pi * (1 + turns) / count, 1.0, 0, 0]))
+    poses = np.stack([np.linalg.matrix_power(wound, k) for k in range(count)])
+    return replace(
+        truth.with_poses(poses),
+        edges=closed,
+        measurements=np.tile(step, (count, 1, 1)),
+        information=np.tile(np.eye(6), (count, 1, 1)),
+    )
+
+
+def test_a_local_optimum_is_told_from_the_global_one() -> None:
+    """A ring wound once too often is a local optimum, each step 2 pi / N too wide."""
+    graph = twisted(1)
+    solver = PoseGraphSolver(graph, PoseGraphConfig(), lambda iteration, cost: None)
+    solver.poses = graph.poses
+    local = solver.run(100)
+    assert local.cost == pytest.approx(0.5 * (2 * np.pi) ** 2 / len(graph.edges))
+    best = optimise_pose_graph(graph)
+    assert best.final_cost < 1e-9
+    assert certify(best).status == "global"
+    wound = replace(best, graph=graph.with_poses(solver.poses), final_cost=local.cost)
+    certificate = certify(wound)
+    assert certificate.status == "not global"
+    assert certificate.cost < 1e-9
+    with pytest.raises(InputError, match="3-D"):
+        certify(optimise_pose_graph(ring(20, True)))
 
 
 @BOTH

@@ -88,18 +88,22 @@ def test_quiet_prints_only_the_path(capsys, file: Path, tmp_path: Path) -> None:
     ("words", "message"),
     [
         (["none.g2o", "--out", "b.g2o"], "none.g2o: no such file"),
-        ([".", "--out", "b"], "holds no graph; give the folder of a run"),
+        (["run", "--out", "b"], "holds no graph; give the folder of a run"),
         (["in.g2o", "--out", "no/b.g2o"], "the folder no is not there"),
         (["in.g2o", "--out", "."], "a folder; give the name of a file"),
         (["in.g2o", "--out", "b.g2o", "--plot", "b.gif"], "cannot draw '.gif'"),
+        (["run", "--out", "b", "--certify"], "--certify: is of pose graphs"),
+        (["in.g2o", "--out", "b.g2o", "--certify"], "--certify: is of 3-D graphs"),
         (["in.g2o", "--out", "b.g2o", "--overwrite"], "--overwrite: is of run folders"),
-        ([".", "--out", "b", "--method", "gnc"], "--method gnc: is of pose graphs"),
+        (["run", "--out", "b", "--method", "gnc"], "--method gnc: is of pose graphs"),
     ],
 )
 def test_errors_are_one_line(
     capsys, file: Path, monkeypatch, words: list[str], message: str
 ) -> None:
     monkeypatch.chdir(file.parent)
+    Path("run").mkdir()
+    Path("run/metrics.json").touch()
     assert cli.main(["optimise", *words]) == 1
     errors = capsys.readouterr().err
     assert message in errors
