@@ -95,8 +95,7 @@ def _optimise(
     if loops is not None:
         is_outlier = find_wrong_loops(graph, solver, config, loops)
         solver.weigh(np.where(is_outlier, 0.0, 1.0))
-        raced = None
-    final = solver.run(config.max_iterations, raced)
+    final = solver.run(config.max_iterations, raced if loops is None else None)
     return PoseGraphResult(
         graph=graph.with_poses(solver.poses),
         method=config.method,

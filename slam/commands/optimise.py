@@ -114,7 +114,7 @@ def _folder(arguments: argparse.Namespace) -> int:
     for option in ("reference", "overwrite", "plot"):
         if getattr(arguments, option):
             raise InputError(f"--{option}: is of one run or graph; leave it out for a folder")
-    more = ("--method", arguments.method) if arguments.method else ()
+    more: tuple[str, ...] = ("--method", arguments.method) if arguments.method else ()
     more += tuple(f"--{name}" for name in ("repair", "certify") if getattr(arguments, name))
     quiet = arguments.quiet
     names = (arguments.input, arguments.out, more, arguments.jobs, arguments.ray, quiet)
