@@ -23,6 +23,7 @@ from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, spanning_tree_pose
 from bmask_slam.graph.pose_graph.solver import Descent, Method, PoseGraphConfig, PoseGraphSolver
 
 RACE_STEPS = 3
+FAR = 10.0  # of the chordal start's cost
 
 __all__ = ["Method", "PoseGraphConfig", "PoseGraphResult", "optimise_pose_graph"]
 
@@ -116,13 +117,23 @@ def _best_start(
     """The start whose cost is lowest after a few steps, and these; the solver is left there.
 
     A low initial cost says little: odometry has none but in its loops, and ends in a local minimum.
-    A start that has converged below the initial costs of the others is not raced against them.
+    The chordal start is always raced. The given one is not if the chordal one has converged below
+    its initial cost, or if it begins at many times the chordal one's. A start that cannot be solved
+    drops out.
     """
     race: list[tuple[str, Descent, Any]] = []
-    for name in sorted(starts, key=lambda name: costs[name]):
+    failure = RuntimeError("no initial value")
+    for name in starts:
         if race and race[0][1].is_nearly_converged and race[0][1].cost <= costs[name]:
             break
+        if race and costs[name] > FAR * costs["chordal"]:
+            break
         solver.poses = starts[name]
-        race.append((name, solver.run(RACE_STEPS), solver.values))
+        try:
+            race.append((name, solver.run(RACE_STEPS), solver.values))
+        except RuntimeError as error:
+            failure = error
+    if not race:
+        raise failure
     name, descent, solver.values = min(race, key=lambda entry: entry[1].cost)
     return name, descent

@@ -133,15 +133,22 @@ class PoseGraphSolver:
 
     @staticmethod
     def _step(optimiser: Any, cost: float) -> bool:
-        """One iteration; whether it succeeded and the cost did not rise."""
+        """One iteration; whether it succeeded and the cost did not rise.
+
+        A step of Gauss-Newton that raises it gets a second one: across a curved valley the first
+        overshoots and the second lands near the bottom, along which damped steps would creep.
+        """
         if not isinstance(optimiser, gtsam.GaussNewtonOptimizer):
             optimiser.iterate()
             return True
         try:
-            optimiser.iterate()
+            for _ in range(2):
+                optimiser.iterate()
+                if optimiser.error() <= cost * (1 + ROUNDING):
+                    return True
         except RuntimeError:  # undetermined without damping
             return False
-        return bool(optimiser.error() <= cost * (1 + ROUNDING))
+        return False
 
     def _optimiser(self, undamped: bool) -> Any:
         if undamped:
