@@ -123,12 +123,12 @@ def _best_start(
     """
     race: list[tuple[str, Descent, Any]] = []
     failure = RuntimeError("no initial value")
-    for name in starts:
+    for name, poses in starts.items():
         if race and race[0][1].is_nearly_converged and race[0][1].cost <= costs[name]:
             break
         if race and costs[name] > FAR * costs["chordal"]:
             break
-        solver.poses = starts[name]
+        solver.poses = poses
         try:
             race.append((name, solver.run(RACE_STEPS), solver.values))
         except RuntimeError as error:
