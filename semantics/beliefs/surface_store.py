@@ -17,6 +17,13 @@ LEAST_PROBABILITY = 1e-3
 """Least probability of a class in one view."""
 MIN_PROBABILITY = 0.4
 """Below it a landmark is on nothing known."""
+SURFACES_OF_THINGS = {
+    "book": "books",
+    "couch": "sofa",
+    "dining table": "table",
+    "tv": "television",
+}
+"""COCO's things that NYU40 has under another name."""
 
 
 def independent_views(views: Array) -> Array:
@@ -37,6 +44,19 @@ def pooled(log_sums: Array, views: Array) -> Array:
     log_p = log_sums * share[:, None]
     p = np.exp(log_p - log_p.max(axis=1, keepdims=True))
     return np.asarray(p / p.sum(axis=1, keepdims=True))
+
+
+def with_things(names: LabelSet, p: Array, things: LabelSet, p_things: Array) -> Array:
+    """Distributions (N, C) of surfaces, with what is known of the things (N, T) at these places.
+
+    What is on a thing has that thing's surface, if there is a class for it; of what is on none, or
+    on one without a class, no more is known than p: sum_t P(t) [c is t's] + (1 - sum_t P(t)) p(c).
+    """
+    found = np.zeros_like(p)
+    for k, name in enumerate(things.names[1:], start=1):
+        if surface := names.number(SURFACES_OF_THINGS.get(name, name)):
+            found[:, surface - 1] += p_things[:, k]
+    return found + np.maximum(1 - found.sum(axis=1, keepdims=True), 0) * p
 
 
 def log_view(probabilities: Floats) -> Floats:

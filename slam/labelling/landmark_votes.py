@@ -13,7 +13,11 @@ from bmask_slam.labelling.landmark_visibility import Observed, VisibleLandmarks,
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.observation import viewpoint_cells
 from bmask_slam.semantics.beliefs.surface_geometry import by_height
-from bmask_slam.semantics.beliefs.surface_store import SurfaceEstimates, SurfaceStore
+from bmask_slam.semantics.beliefs.surface_store import (
+    SurfaceEstimates,
+    SurfaceStore,
+    with_things,
+)
 from bmask_slam.semantics.beliefs.votes import PixelAssignment, VoteConfig, vote
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.instances.surfaces import CodedSurfaces, SurfaceClasses, coded
@@ -107,6 +111,21 @@ class LabelVotes:
             self._surfaces.update(seen.labels, visible.landmark_ids, seen.at(visible.pixels))
         return ids
 
+    def surfaces(
+        self, ids: Ints, poses: dict[int, Array], up_world: Array, things: LabelSet
+    ) -> SurfaceEstimates | None:
+        """What landmarks (N,) lie on, seen by cameras at these poses; None if not known.
+
+        Labels of ``things`` tell it too.
+        """
+        store, points = self._surfaces, self._map.world.landmarks.points_world[ids]
+        if len(store.names) < 2:
+            return None
+        cameras = np.array([T[:3, 3] for T in poses.values()]).reshape(-1, 3)
+        p = by_height(store.names, store.probabilities(ids), points, cameras, up_world)
+        p = with_things(store.names, p, things, self._labels.probabilities(ids))
+        return SurfaceEstimates.of(store.names, p)
+
     def state(self) -> Arrays:
         """The masks of the last keyframes, as named arrays."""
         views = [v.assignment for v in self._remembered.values()]
@@ -183,17 +202,6 @@ def _thinned(assignment: PixelAssignment) -> PixelAssignment:
     depth_m = assignment.depth_m[:: max(step, 1), :: max(step, 1)].copy()
     without = tuple(replace(i, mask=_NO_MASK) for i in assignment.instances)
     return PixelAssignment(without, owner, under, inner, depth_m, assignment.depth_range_m)
-
-
-def estimated_surfaces(
-    store: SurfaceStore, ids: Ints, points_world: Array, poses: dict[int, Array], up_world: Array
-) -> SurfaceEstimates | None:
-    """What landmarks (N,) at (N, 3) lie on, seen by cameras at these poses; None if not known."""
-    if len(store.names) < 2:
-        return None
-    cameras = np.array([T[:3, 3] for T in poses.values()]).reshape(-1, 3)
-    p = by_height(store.names, store.probabilities(ids), points_world, cameras, up_world)
-    return SurfaceEstimates.of(store.names, p)
 
 
 def _instances(state: Arrays) -> Sequence[Instance]:

@@ -15,7 +15,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.labelling.config import SemanticsConfig, above
 from bmask_slam.labelling.landmark_visibility import Observed, observed_by
-from bmask_slam.labelling.landmark_votes import LabelVotes, estimated_surfaces
+from bmask_slam.labelling.landmark_votes import LabelVotes
 from bmask_slam.labelling.results import Attachment, LandmarkLabels, MapObjects
 from bmask_slam.moving.keyframe_masks import KeyframeMasks
 from bmask_slam.semantics.beliefs.class_sizes import read_sizes
@@ -173,8 +173,7 @@ class SemanticMapper:
             return None
         poses, ground = self._posed(keyframes)
         self.labels.judge(*self.objects.landmark_evidence(poses, ground))
-        points = self._map.world.landmarks.points_world[ids]
-        surfaces = estimated_surfaces(self.surfaces, ids, points, poses, ground.up_world)
+        surfaces = self._label_votes.surfaces(ids, poses, ground.up_world, self.names)
         return LandmarkLabels(self.names, self.labels.estimates(ids), surfaces)
 
     def map_objects(self, keyframes: Sequence[Keyframe]) -> MapObjects:

@@ -11,6 +11,7 @@ from bmask_slam.semantics.beliefs.surface_store import (
     SurfaceStore,
     independent_views,
     pooled,
+    with_things,
 )
 from bmask_slam.semantics.labels import label_set
 
@@ -68,3 +69,13 @@ def test_a_state_goes_on_identically() -> None:
     empty = SurfaceStore()
     empty.restore(SurfaceStore().state())
     assert len(empty.names) == 1
+
+
+def test_what_is_on_a_known_thing_has_its_surface() -> None:
+    surfaces, things = label_set(("paper", "books", "chair")), label_set(("book", "cup", "chair"))
+    p = np.array([[0.7, 0.2, 0.1], [0.7, 0.2, 0.1], [0.7, 0.2, 0.1]])
+    on = np.array([[0.2, 0.8, 0, 0], [0.2, 0, 0.8, 0], [0, 0.5, 0.2, 0.3]])  # unknown first
+    found = with_things(surfaces, p, things, on)
+    assert found[0] == pytest.approx([0.2 * 0.7, 0.8 + 0.2 * 0.2, 0.2 * 0.1])
+    assert found[1] == pytest.approx(p[1])  # cups are no class of surfaces
+    assert found[2] == pytest.approx([0.2 * 0.7, 0.5 + 0.2 * 0.2, 0.3 + 0.2 * 0.1])
