@@ -2,6 +2,7 @@
 # make test    sets up and runs the tests; TESTS="tests/graph -x" passes other arguments to pytest
 # make check   lint, format, types, security (bandit, pip-audit) and tests (with the layer rule)
 # make typing  makes build/typing, the tree that mypy (and an editor) reads the package from
+# make docs    builds the documentation site in build/site, strictly
 # make fuzz    gives every reader broken files for two minutes; FUZZ="--seconds 3600 --seed 7" for longer
 # make bench   measures and writes docs/results/benchmarks.md; BENCH="..." passes arguments
 # make clean   removes what these made, but for runs/
@@ -21,7 +22,7 @@ export PYTHONDONTWRITEBYTECODE :=
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
-.PHONY: demo test check typing fuzz bench setup clean
+.PHONY: demo test check docs typing fuzz bench setup clean
 .DELETE_ON_ERROR:
 
 demo: $(DEMO)
@@ -55,6 +56,13 @@ typing:
 	  name=$$(basename $$path); \
 	  test $$name = __pycache__ || ln -s ../../../$${path%/} $(TYPING)/$$name; \
 	done
+
+# The site, by mkdocs, without anything loaded from elsewhere; a broken link or page is an error.
+docs: $(READY) typing
+	@$(BIN)/python -m pip install -qq --constraint constraints.txt --editable '.[docs]'
+	@$(BIN)/python docs/parameters.py
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "build/site/index.html"
 
 fuzz: $(READY)
 	@$(BIN)/python tests/fuzz/run.py $(FUZZ)
