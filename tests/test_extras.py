@@ -37,7 +37,7 @@ def answers(office: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
         "evaluate": ["evaluate", run, "--reference", sequence],
         "optimise": ["optimise", run, "--out", str(folder / "better"), "--quiet"],
         "export": ["export", run, "--format", "g2o", "--out", str(folder / "run.g2o")],
-        "info": ["info", sequence],
+        "info": ["info", sequence, "--json"],
         "run light": ["run", sequence, "--out", str(folder / "light"), "--quiet"],
         "run --map": ["run", sequence, "--segmenter", "none", "--map", "--out", f"{run}2"],
         "map": ["map", run],
@@ -86,6 +86,11 @@ def test_what_is_missing_is_one_line_with_its_cure(
     (line,) = errors.splitlines()
     assert f"needs {library}, which is not installed" in line
     assert f"pip install 'bmask-slam[{extra}]'" in line
+
+
+def test_info_as_json(answers: dict[str, list], office: Path) -> None:
+    found = json.loads(answers["info"][1])
+    assert (found["frames"], found["camera"]["width"], found["folder"]) == (15, 160, str(office))
 
 
 def test_a_run_without_torch_can_go_without_labels(answers: dict[str, list]) -> None:

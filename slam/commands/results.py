@@ -35,6 +35,7 @@ def add_query(commands: Commands) -> None:
     parser.add_argument("--all", action="store_true", help="without a label: all objects")
     text = "the nearest to a place first: its coordinates in the world frame, in metres"
     parser.add_argument("--near", nargs=3, type=float, metavar=("X", "Y", "Z"), help=text)
+    parser.add_argument("--json", action="store_true", help="print the answer as JSON")
     related = parser.add_mutually_exclusive_group()
     for kind in ("on", "under", "inside", "beside"):
         text = f"only what is {kind} an object of this label or id; without it, {kind} any"
@@ -44,7 +45,13 @@ def add_query(commands: Commands) -> None:
 def _query(arguments: argparse.Namespace) -> int:
     import numpy as np
 
-    from bmask_slam.run_folder.scene.query import RELATIONS, Asked, ask, format_answer
+    from bmask_slam.run_folder.scene.query import (
+        RELATIONS,
+        Asked,
+        answer_as_json,
+        ask,
+        format_answer,
+    )
 
     given = {kind: getattr(arguments, kind) for kind in RELATIONS}
     relation = next((kind for kind, other in given.items() if other is not None), None)
@@ -56,7 +63,8 @@ def _query(arguments: argparse.Namespace) -> int:
         given[relation] if relation is not None else "",
         MOST if limited else None,
     )
-    print(format_answer(ask(arguments.run, asked)))
+    answer = ask(arguments.run, asked)
+    print(answer_as_json(answer) if arguments.json else format_answer(answer))
     return 0
 
 

@@ -78,11 +78,12 @@ def add_info(commands: Commands) -> None:
     parser.set_defaults(handler=_info)
     parser.add_argument("sequence", type=Path, help="recording, or ROS bag")
     add_camera_argument(parser)
+    parser.add_argument("--json", action="store_true", help="print it as JSON; not of a bag")
 
 
 def _info(arguments: argparse.Namespace) -> int:
     from bmask_slam.runtime.progress import console_log
-    from bmask_slam.sequences import format_info, open_sequence, sequence_info
+    from bmask_slam.sequences import format_info, info_as_json, open_sequence, sequence_info
     from bmask_slam.sequences.bags.bag_file import format_topics, is_bag, open_bag
 
     if is_bag(arguments.sequence):
@@ -91,7 +92,7 @@ def _info(arguments: argparse.Namespace) -> int:
         return 0
     with console_log():
         info = sequence_info(open_sequence(arguments.sequence, camera=arguments.camera))
-    print(format_info(info))
+    print(info_as_json(info) if arguments.json else format_info(info))
     return 0
 
 

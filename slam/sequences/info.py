@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +107,13 @@ def format_info(info: SequenceInfo) -> str:
         ("ground truth", truth),
     )
     return "\n".join(f"{name:<16} {value}" for name, value in rows)
+
+
+def info_as_json(info: SequenceInfo) -> str:
+    """The information as JSON, by the names of `SequenceInfo`; null for what is not known."""
+    found = asdict(info)
+    found["depth_percentiles_m"] = [None if np.isnan(v) else v for v in info.depth_percentiles_m]
+    return json.dumps(found, indent=1, default=lambda v: getattr(v, "tolist", v.__str__)())
 
 
 def _depth_statistics(sequence: Sequence, count: int) -> tuple[float, tuple[float, float, float]]:

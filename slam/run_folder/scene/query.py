@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -143,6 +145,26 @@ def format_answer(answer: Answer) -> str:
         rest = "are farther away" if answer.distances_m else "are less sure"
         lines.append(f"and {answer.omitted} objects that {rest}: --all")
     return "\n".join(lines)
+
+
+def answer_as_json(answer: Answer) -> str:
+    """The answer as JSON: metres in the world frame, names as in objects.json."""
+    found: list[dict[str, Any]] = [
+        {
+            "id": o.id,
+            "label": o.label,
+            "probability": o.probability,
+            "centroid_world_m": o.centroid_world.tolist(),
+            "box": {"T_world_box": o.box.T_world_box.tolist(), "size_m": o.box.size_m.tolist()},
+            "keyframes": o.keyframes.tolist(),
+        }
+        for o in answer.objects
+    ]
+    for key, values in (("distance_m", answer.distances_m), ("relation", answer.others)):
+        for one, value in zip(found, values, strict=False):  # none, if it was not asked for
+            one[key] = value
+    content = {"objects": found, "counts": answer.counts, "omitted": answer.omitted}
+    return json.dumps(content, indent=1)
 
 
 def _listed(counts: dict[str, int]) -> str:

@@ -80,6 +80,16 @@ def test_the_most_certain_object_is_first(run: Path, capsys: pytest.CaptureFixtu
     assert second.endswith("0-2, 5")
 
 
+def test_an_answer_as_json(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["query", str(run), "chair", "--near", "0", "-1", "0.5", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    chairs = {found["id"]: found for found in answer["objects"]}
+    assert chairs[4]["centroid_world_m"] == pytest.approx([1.0, -2.0, 3.5])
+    assert sorted(chairs[4]["box"]["size_m"]) == pytest.approx([0.4, 0.9, 1.25])
+    assert chairs[4]["distance_m"] > 0
+    assert answer["counts"] == {"chair": 2, "desk": 1}
+
+
 def test_only_the_most_certain_objects_are_listed_without_all(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
