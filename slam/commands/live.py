@@ -24,6 +24,7 @@ from bmask_slam.graph.errors import InputError
 if TYPE_CHECKING:
     from bmask_slam.graph.sensors.streams import Measurements
     from bmask_slam.live.live_slam import LiveOptions, LiveSlam
+    from bmask_slam.live.play import Listener
     from bmask_slam.live.sources.opening import SourceOptions
     from bmask_slam.live.sources.source import Source
     from bmask_slam.system_config import SystemConfig
@@ -36,7 +37,7 @@ of their own. The run folder is that of `run`, with health.json, which is rewrit
 SENSORS = ("imu", "odometry", "position", "accelerometer")
 SOURCE_HELP = """\
 recording in any layout of docs/data.md, ROS 1 .bag, ROS 2 bag folder, .mcap, realsense: for the
-RealSense that is plugged in, or opencv:N for device N of OpenNI 2"""
+RealSense that is plugged in, opencv:N for device N of OpenNI 2, or ros2: (ros2:DOMAIN)"""
 
 
 def add_live(commands: Commands) -> None:
@@ -77,6 +78,10 @@ def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
     for sensor in SENSORS:
         text = f"of a bag: {sensor}, with its sensors.{sensor} settings (default: none)"
         parser.add_argument(f"--{sensor}-topic", metavar="T", default="", help=text)
+    text = "of ros2: frames, topics and the camera's place on the robot, as YAML"
+    parser.add_argument("--ros2-params", type=Path, metavar="F", help=text)
+    text = "of ros2: ask for images that are lost again"
+    parser.add_argument("--reliable", action="store_true", help=text)
 
 
 def source_options(arguments: argparse.Namespace) -> SourceOptions:
@@ -90,6 +95,7 @@ def source_options(arguments: argparse.Namespace) -> SourceOptions:
         follow=arguments.follow,
         silence_s=arguments.silence,
         topics=bag_topics(arguments),
+        reliable=arguments.reliable,
     )
 
 
@@ -108,7 +114,8 @@ def _live(arguments: argparse.Namespace) -> int:
                 slam.add_measurements(measured)
             if slam.viewer_url:
                 print(f"in a browser: {slam.viewer_url}", flush=True)
-            ended_by = play(slam, source, PlayOptions(not source.waits, quiet=arguments.quiet))
+            told = PlayOptions(not source.waits, quiet=arguments.quiet)
+            ended_by = play(slam, source, told, ros2_listener(arguments, source))
     if arguments.quiet:
         print(slam.out)
     else:
@@ -134,6 +141,15 @@ def measured_beside(
         if given
         else read_folder(folder, config.sensors.enabled)
     )
+
+
+def ros2_listener(arguments: argparse.Namespace, source: Source) -> Listener | None:
+    """What publishes the results, where the frames come from ROS 2."""
+    from bmask_slam.config.configuration import resolve
+    from bmask_slam.live.ros2.outputs import Ros2Frames, Ros2Publisher
+
+    node = getattr(source, "node", None)
+    return None if node is None else Ros2Publisher(node, resolve(Ros2Frames, arguments.ros2_params))
 
 
 def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -16,6 +16,7 @@ from bmask_slam.runtime.progress import make_bar
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.sequences.prefetch import prefetched
+from bmask_slam.tracking.results import FrameResult
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +48,13 @@ class PlayOptions:
     quiet: bool = False
 
 
-def play(slam: LiveSlam, source: Source, options: PlayOptions) -> signal.Signals | None:
+Listener: TypeAlias = Callable[[FrameResult, LiveSlam], None]
+"""Called with each frame's result, in the thread that tracks."""
+
+
+def play(
+    slam: LiveSlam, source: Source, options: PlayOptions, listener: Listener | None = None
+) -> signal.Signals | None:
     """Track a source's frames; returns the signal that ended it early, if one did.
 
     Frames that are refused are skipped with a warning.
@@ -63,7 +70,9 @@ def play(slam: LiveSlam, source: Source, options: PlayOptions) -> signal.Signals
                 slam.catch_up(WAITING)
                 prepared = replace(ahead, arrived_s=time.monotonic())
             try:
-                _track(slam, source, frame, prepared)
+                result = _track(slam, source, frame, prepared)
+                if listener is not None:
+                    listener(result, slam)
             except InputError as error:
                 logger.warning("%s", error)
             if not options.quiet:
@@ -74,12 +83,13 @@ def play(slam: LiveSlam, source: Source, options: PlayOptions) -> signal.Signals
     return stop.signal
 
 
-def _track(slam: LiveSlam, source: Source, frame: Frame, prepared: Prepared) -> None:
+def _track(slam: LiveSlam, source: Source, frame: Frame, prepared: Prepared) -> FrameResult:
     """Track a frame; the source goes on with the camera that may have been found meanwhile."""
     camera, images = slam.camera, (frame.rgb, frame.depth_m)
-    slam.track(frame.timestamp_s, *images, prepared, frame.name, frame.depth_lag_s)
+    result = slam.track(frame.timestamp_s, *images, prepared, frame.name, frame.depth_lag_s)
     if slam.camera != camera and source.use is not None:
         source.use(slam.camera)
+    return result
 
 
 def _with_features(slam: LiveSlam, source: Source) -> _Pairs:

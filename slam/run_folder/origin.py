@@ -72,6 +72,6 @@ def find_sequence(run: Path) -> Path:
     sequence = read_origin(run).sequence
     if sequence is None or not _is_there(sequence):
         named = f"names {str(sequence)!r}, which is not there" if sequence else "names no sequence"
-        cure = "give the run's images as --sequence"
+        cure = "give the folder of the run's images as --sequence"
         raise InputError(f"{run / CONFIG}: {named}; {cure}")
     return sequence

@@ -47,7 +47,7 @@ def hole(camera: Camera) -> slice:
 
 def _image(path: Path, rgb: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])
+    cv2.imwrite(str(path), rgb[..., ::-1])
 
 
 def _depth(path: Path, values: np.ndarray) -> None:

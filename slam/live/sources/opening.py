@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,13 +11,14 @@ from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
 from bmask_slam.live.sources.opencv_camera import OpenCvSource
 from bmask_slam.live.sources.realsense_camera import RealSenseSource
+from bmask_slam.live.sources.ros2_source import Ros2Source
 from bmask_slam.live.sources.source import Limited, RecordedSource, Source
 from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.bags.bag_file import is_bag
 from bmask_slam.sequences.bags.topics import BagTopics
 from bmask_slam.sequences.formats.layouts import is_recording_file
 
-REALSENSE, OPENCV = "realsense:", "opencv:"
+REALSENSE, OPENCV, ROS2 = "realsense:", "opencv:", "ros2:"
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,8 @@ class SourceOptions:
         max_frames: end after so many frames.
         follow: the folder is still being written.
         silence_s: such a folder, or a camera, has ended when nothing new comes for so long.
-        topics: of a bag.
+        topics: of a bag, or of ROS 2.
+        reliable: ROS 2 sends images again that are lost.
     """
 
     camera: Path | None = None
@@ -38,6 +41,7 @@ class SourceOptions:
     follow: bool = False
     silence_s: float = 10.0
     topics: BagTopics = field(default_factory=BagTopics)
+    reliable: bool = False
 
 
 def open_source(text: str, options: SourceOptions) -> Source:
@@ -52,6 +56,10 @@ def open_source(text: str, options: SourceOptions) -> Source:
         source = RealSenseSource(options.camera, options.silence_s)
     elif text.startswith(OPENCV):
         source = OpenCvSource(_device(text), options.camera, options.silence_s)
+    elif text.startswith(ROS2):
+        domain = _domain(text)
+        silence_s, reliable = options.silence_s, options.reliable
+        source = Ros2Source(domain, options.topics, options.camera, silence_s, reliable)
     elif is_bag(path):
         source = BagSource(path, options.topics, options.camera, options.realtime)
     elif options.follow:
@@ -63,9 +71,17 @@ def open_source(text: str, options: SourceOptions) -> Source:
     else:
         raise InputError(
             f"{text}: not a source; give a recording, a .bag, a bag folder, a .mcap, "
-            "realsense: or opencv:N"
+            "realsense:, opencv:N or ros2:"
         )
     return source if options.max_frames is None else Limited(source, options.max_frames)
+
+
+def _domain(text: str) -> int:
+    """The DDS domain of ros2:N; ros2: is that of ROS_DOMAIN_ID, or 0."""
+    number = text.removeprefix(ROS2) or os.environ.get("ROS_DOMAIN_ID", "0")
+    if not (number.isdecimal() and len(number) < 4):
+        raise InputError(f"{text}: {number!r} is no domain of ROS 2; write e.g. ros2:0")
+    return int(number)
 
 
 def _device(text: str) -> int:

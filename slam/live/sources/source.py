@@ -134,6 +134,7 @@ class Limited:
         self.groundtruth = source.groundtruth
         self.counts, self.waits = source.counts, source.waits
         self.use = source.use
+        self.node = getattr(source, "node", None)  # of ROS 2
         self._source, self._max_frames = source, max_frames
 
     def frames(self) -> Iterator[Frame]:

@@ -40,7 +40,7 @@ _FIELDS = {
 _SDK = "/device_0/sensor_{}/{}_0/"
 _SDK_COLOUR, _SDK_DEPTH = _SDK.format(1, "Color"), _SDK.format(0, "Depth")
 _SDK_UNITS = "/device_0/sensor_0/option/Depth_Units/value"
-_STATIC = "/tf_static"
+TRANSFORMS = "/tf_static"
 MAX_STATIC = 100
 """Messages of /tf_static that are read; there is one for each node that knows a transform."""
 
@@ -206,7 +206,7 @@ def _sdk_extrinsics(bag: Bag) -> Array | None:
 def _static_extrinsics(bag: Bag, rgb_frame: str, depth_frame: str) -> Array | None:
     """T_rgb_depth by the tree of /tf_static; None if it does not hold both frames."""
     parents: dict[str, tuple[str, Array]] = {}
-    for count, (_, message) in enumerate(bag.messages(_STATIC)):
+    for count, (_, message) in enumerate(bag.messages(TRANSFORMS)):
         if count == MAX_STATIC or not hasattr(message, "transforms"):
             break
         for one in message.transforms:
