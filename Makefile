@@ -62,7 +62,7 @@ docs: $(READY) typing
 	@$(BIN)/python -m pip install -qq --constraint constraints.txt --editable '.[docs]'
 	@$(BIN)/python docs/parameters.py
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
-	@echo "build/site/index.html"
+	@echo "build/site; to read it with its search: $(BIN)/python -m http.server --directory build/site"
 
 fuzz: $(READY)
 	@$(BIN)/python tests/fuzz/run.py $(FUZZ)
