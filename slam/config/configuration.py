@@ -54,8 +54,9 @@ RENAMED = {
 
 In the path the groups have their present names.
 """
-REMOVED = {"features.octaves": 0}
-"""Settings that are no more, and the value that is still read: what is done now."""
+REMOVED = {"features.octaves": (0, "features.layer_shares")}
+"""Settings that are no more: the value that is still read, which is what is done now, and what
+serves for others."""
 
 
 def find_config(name: str) -> Path:
@@ -134,7 +135,7 @@ def _with_present_names(tree: Any, prefix: str = "") -> Any:
         return tree
     found: dict[str, Any] = {}
     for key, value in tree.items():
-        if REMOVED.get(f"{prefix}{key}", ...) == value:
+        if value == REMOVED.get(f"{prefix}{key}", (...,))[0]:
             continue
         name = RENAMED.get(f"{prefix}{key}", key)
         name = key if name in tree else name
@@ -257,6 +258,8 @@ def _suggestion(root: Any, prefix: str, key: str) -> str:
     every = list(_paths(root))
     if present := RENAMED.get(f"{prefix}{key}"):
         return f"it is called {prefix}{present} now"
+    if removed := REMOVED.get(f"{prefix}{key}"):
+        return f"it is no more, see {removed[1]}"
     siblings = [p for p in every if p.startswith(prefix) and "." not in p[len(prefix) :]]
     close = difflib.get_close_matches(prefix + key, siblings, 1, 0.7)
     if not close:

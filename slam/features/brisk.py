@@ -11,8 +11,10 @@ import numpy as np
 from bmask_slam.features.fixed_size_descriptor import FixedSizeBrisk
 from bmask_slam.graph.arrays import Array, Bits, Bytes, Floats, Image, Ints
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences.frame import Frame
 
+MAX_LAYERS = 4
 FINEST_SIZE_PX = 12.0  # OpenCV's size of a BRISK keypoint in the finest layer
 
 
@@ -43,6 +45,13 @@ class FeatureConfig:
     depth_edge_ratio: float = 0.04
     min_depth_m: float = 0.3
     max_depth_m: float = 8.0
+
+    def __post_init__(self) -> None:
+        shares = self.layer_shares
+        if not (1 <= len(shares) <= MAX_LAYERS and min(shares) > 0 and sum(shares) < 1.001):
+            raise InputError(
+                f"layer_shares {list(shares)}: give 1 to {MAX_LAYERS} positive shares of at most 1"
+            )
 
 
 @dataclass(frozen=True)

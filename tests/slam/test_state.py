@@ -256,6 +256,7 @@ def test_compared_classes_have_only_compared_attributes(system: SlamSystem) -> N
     pose_factors = {"pose_factors", "pose_factors_of", "_next_number"}
     assert vars(tables).keys() == {
         *("keyframes", "landmarks", "observations", "marginalised", "own_factors", "next_own"),
+        "inertial",
         *pose_factors,
     }
     rows = {"of_keyframe", "of_landmark", "_free", "_columns", "_slots", "_used"}

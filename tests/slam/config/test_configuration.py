@@ -263,3 +263,10 @@ def test_an_older_and_the_present_name_in_one_file_are_refused(tmp_path: Path) -
     file = write(tmp_path, "feed: {}\nfactor_selection: {}\n")
     with pytest.raises(InputError, match="unknown key feed; it is called factor_selection now"):
         resolve(SystemConfig, file)
+
+
+def test_a_setting_that_is_no_more_is_named_with_what_serves_now(tmp_path: Path) -> None:
+    file = tmp_path / "old.yaml"
+    file.write_text("features: {octaves: 2}")
+    with pytest.raises(InputError, match=r"octaves.*no more, see features\.layer_shares"):
+        resolve(SystemConfig, file)

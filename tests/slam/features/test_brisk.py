@@ -17,6 +17,7 @@ from bmask_slam.features.brisk import (
 )
 from bmask_slam.features.matching import hamming
 from bmask_slam.graph.camera import KINECT_DISPARITY_SIGMA_PX, Camera, DepthNoise
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import make_pose, se3_exp, so3_exp
 from bmask_slam.sequences.frame import Frame
 
@@ -306,3 +307,9 @@ def test_the_reserve_equals_the_rest_of_a_larger_search() -> None:
         common, others = getattr(both, name)[rows >= 0], getattr(larger, name)[rows[rows >= 0]]
         # sums over a patch are rounded by how many patches some processors take at once
         np.testing.assert_allclose(common, others, rtol=1e-5 * (name == "angles_rad"), err_msg=name)
+
+
+@pytest.mark.parametrize("shares", [(), (0.7, 0.7), (1.0, -0.1), (0.2,) * 5])
+def test_shares_of_layers_are_checked(shares: tuple[float, ...]) -> None:
+    with pytest.raises(InputError, match="layer_shares"):
+        dataclasses.replace(CONFIG, layer_shares=shares)
