@@ -6,19 +6,25 @@ import importlib
 from types import ModuleType
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.reading import in_short
 
 
 def import_extra(name: str, needed_by: str, extra: str, instead: str = "") -> ModuleType:
     """A module of a library that the pip extra ``extra`` installs.
 
     Raises:
-        InputError: it is not installed. The text begins with ``needed_by``, a source or a task,
-            and gives the command that installs it, and ``instead``, what else can be done.
+        InputError: it is not installed, or cannot be loaded. The text begins with ``needed_by``, a
+            source or a task, and gives the command that installs it, and ``instead``, what else
+            can be done.
     """
     try:
         return importlib.import_module(name)
-    except ModuleNotFoundError as error:
+    except (ImportError, OSError) as error:  # OSError: a shared library that is not there
         library = name.partition(".")[0]
-        text = f"{needed_by}: needs {library}, which is not installed ({error.msg})"
+        missing = isinstance(error, ModuleNotFoundError) and error.name == library
+        what = "which is not installed" if missing else "which cannot be loaded"
+        text = f"{needed_by}: needs {library}, {what} ({in_short(error)})"
         cure = f"pip install 'bmask-slam[{extra}]'"
+        if not missing:
+            cure = f"remove it, and {cure}"
         raise InputError(f"{text}; {cure}{f', or {instead}' if instead else ''}") from error

@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.extras import import_extra
+
 LIBRARIES = ("torch", "open3d", "safetensors", "libusb_package", "rerun", "ray", "rosbags", "shtab")
 CALLS = """
 import contextlib, io, json, sys, time
@@ -86,6 +89,27 @@ def test_what_is_missing_is_one_line_with_its_cure(
     (line,) = errors.splitlines()
     assert f"needs {library}, which is not installed" in line
     assert f"pip install 'bmask-slam[{extra}]'" in line
+
+
+@pytest.mark.parametrize(
+    ("code", "what"),
+    [
+        ("raise ImportError('libx.so.1: cannot open\\n shared object')", "libx.so.1: cannot open"),
+        ("raise OSError('libx.so.1: no such file')", "libx.so.1: no such file"),
+        ("import no_such_part_of_it", "No module named 'no_such_part_of_it'"),
+    ],
+)
+def test_a_library_that_cannot_be_loaded_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, what: str
+) -> None:
+    (tmp_path / "broken_library.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match="needs broken_library, which cannot be loaded") as caught:
+        import_extra("broken_library", "a test", "some")
+    assert what in str(caught.value)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="needs no_such_library, which is not installed"):
+        import_extra("no_such_library.part", "a test", "some")
 
 
 def test_info_as_json(answers: dict[str, list], office: Path) -> None:

@@ -71,9 +71,12 @@ class BagMaker:
     """Writes a bag: .bag is ROS 1, .mcap one file, else a folder (``sqlite3`` or ``mcap``).
 
     ``packing``: "bz2" or "lz4" for ROS 1, "message", "file" or "storage" (of mcap) for ROS 2.
+    ``begin_s``: when it is recorded.
     """
 
-    def __init__(self, path: Path, storage: str = "sqlite3", packing: str = "none") -> None:
+    def __init__(
+        self, path: Path, storage: str = "sqlite3", packing: str = "none", begin_s: float = BEGIN_S
+    ) -> None:
         self.is1, self.path = path.suffix == ".bag", path
         self._types = TYPES[self.is1]
         self._folder = path.with_suffix("") if path.suffix == ".mcap" else path
@@ -87,7 +90,7 @@ class BagMaker:
         elif packing != "none":
             self._writer.set_compression(CompressionMode[packing.upper()], CompressionFormat.ZSTD)
         self._connections: dict[str, Any] = {}
-        self._received_ns = int(BEGIN_S * 1e9)
+        self._received_ns = int(begin_s * 1e9)
 
     def __enter__(self) -> BagMaker:
         self._writer.open()

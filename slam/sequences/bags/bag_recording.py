@@ -80,7 +80,7 @@ class _BagMessages:
         weakref.finalize(self, self._open.close)
         self._bag: Bag | None = None
         self._stream: Iterator[tuple[str, int, Any]] = iter(())
-        self._read_to_ns = 0
+        self._read_to_ns: int | None = None  # None: no stream is open
         self._kept: OrderedDict[tuple[str, float], Any] = OrderedDict()
 
     def colour(self, file: Path) -> Image:
@@ -101,7 +101,8 @@ class _BagMessages:
 
     def _read_to(self, place: _Place, key: tuple[str, float]) -> None:
         """Read on until a message is among the kept ones. Raises InputError if it is not there."""
-        if not self._read_to_ns <= place.time_ns <= self._read_to_ns + AHEAD_NS:
+        at_ns = self._read_to_ns
+        if at_ns is None or not at_ns <= place.time_ns <= at_ns + AHEAD_NS:
             self._bag = self._bag or self._open.enter_context(open_bag(self._path))
             self._stream = self._bag.records(self._topics, place.time_ns - BEFORE_NS)
         for topic, time_ns, message in self._stream:
@@ -113,6 +114,6 @@ class _BagMessages:
                 return
             if time_ns > place.time_ns:
                 break
-        self._read_to_ns = 0
+        self._read_to_ns = None
         if key not in self._kept:
             raise InputError(f"{self._path}: no message of {place.stamp_s:.6f} s on {place.topic}")

@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.reading import MAX_TEXT_BYTES, read_bytes
+from bmask_slam.graph.sensors.streams import FILES
 from bmask_slam.graph.trajectory import write_tum
 from bmask_slam.graph.whole_file import whole_folder
 from bmask_slam.sequences.cameras import write_camera
@@ -24,6 +26,8 @@ logger = logging.getLogger(__name__)
 METRE, MIN_SCALE = 5000.0, 1000.0
 """Stored depth of one metre where the recording's is below the second, as of float32 metres."""
 MAX_STORED = 65535
+LEFT_BEHIND = ("right.txt", "annotations.json", "mav0/imu0/data.csv", "imu0/data.csv")
+"""Files of a recording that are not carried over; a warning names them."""
 Progress = Callable[[int, int], None]
 
 
@@ -36,6 +40,7 @@ class Converted:
         colour, depth: images.
         broken: images that could not be read, and were left out.
         too_far: depth values beyond what 16 bits hold, written as missing.
+        copied: files of sensors.
     """
 
     layout: str
@@ -43,11 +48,13 @@ class Converted:
     depth: int = 0
     broken: int = 0
     too_far: int = 0
+    copied: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         text = f"{self.layout}: {self.colour} colour and {self.depth} depth images"
         if self.broken:
             text += f", {self.broken} broken ones left out"
+        text += "".join(f", {name}" for name in self.copied)
         return text + (f", {self.too_far} depths too far for 16 bits" if self.too_far else "")
 
 
@@ -60,8 +67,8 @@ def convert(
 ) -> Converted:
     """Write ``folder``, which must not be there; it appears when it is complete.
 
-    Stamps stay as they are. Depth is registered to colour; a ``depth_scale`` below 1000 to the
-    metre becomes 5000.
+    Stamps stay as they are; depth is registered to colour, and a ``depth_scale`` below 1000 to the
+    metre becomes 5000. The files of sensors beside the images are copied.
 
     Raises:
         InputError: the recording cannot be read, holds no readable image, or the folder is there.
@@ -84,7 +91,24 @@ def convert(
         write_camera(out / "camera.yaml", saved, f"{recording.layout}: {recording.camera_source}")
         if recording.groundtruth is not None:
             write_tum(out / "groundtruth.txt", recording.groundtruth)
+        written.copied = _copy_sensors(recording.path, out)
     return written
+
+
+def _copy_sensors(source: Path, out: Path) -> tuple[str, ...]:
+    """Copy the files of sensors that are plain files; a warning names what else stays behind."""
+    copied = []
+    for name in FILES.values():
+        path = source / name
+        if path.is_symlink():
+            logger.warning("not carried over: %s, which is a link", path)
+        elif path.is_file():
+            (out / name).write_bytes(read_bytes(path, "correct or remove it", MAX_TEXT_BYTES))
+            copied.append(name)
+    for name in LEFT_BEHIND:
+        if (source / name).is_file():
+            logger.warning("not carried over: %s", source / name)
+    return tuple(copied)
 
 
 def _first(images: ImageList, count: int | None) -> ImageList:

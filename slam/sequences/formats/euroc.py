@@ -38,8 +38,8 @@ def is_euroc(folder: Path) -> bool:
 def open_euroc(folder: Path, given: Path | Camera | None) -> Recording:
     """Depth of a camera with intrinsics of its own is registered. Raises InputError.
 
-    Both cameras' ``T_BS`` are their poses on the body, whose truth is that of
-    state_groundtruth_estimate0.
+    Both cameras' ``T_BS`` are their poses on the body. The truth is that of the first of
+    ``TRUTHS``, by its own ``T_BS``.
     """
     root = _root(folder)
     own, T_body_colour = _camera(root / "cam0" / "sensor.yaml")
@@ -112,7 +112,11 @@ def _numbers(value: Any, count: int, path: Path, name: str) -> list[float] | Non
 
 
 def _truth(root: Path, T_body_colour: Array) -> Trajectory | None:
-    """T_world_camera by data.csv: nanoseconds, position, quaternion w x y z of the body."""
+    """T_world_camera by data.csv: nanoseconds, position, quaternion w x y z of the truth's sensor.
+
+    The sensor.yaml beside it says where that sensor S is on the body B; vicon0's are its markers:
+    ``T_world_camera = T_world_S inverse(T_BS) T_body_colour``.
+    """
     path = next((p for n in TRUTHS if (p := root / n / "data.csv").is_file()), None)
     if path is None:
         return None
@@ -124,5 +128,6 @@ def _truth(root: Path, T_body_colour: Array) -> Trajectory | None:
     if not (np.isfinite(table).all() and ((lengths > 0.5) & (lengths < 2)).all()):
         raise InputError(f"{path}: a pose that is not finite, or no unit quaternion; remove it")
     R = rotation_from_quaternion(table[:, [5, 6, 7, 4]])
-    poses = make_pose(R, table[:, 1:4]) @ T_body_colour
+    _, T_body_sensor = _camera(path.with_name("sensor.yaml"))
+    poses = make_pose(R, table[:, 1:4]) @ inverse(T_body_sensor) @ T_body_colour
     return trajectory_of(table[:, 0] * NANOSECONDS, poses, str(path))

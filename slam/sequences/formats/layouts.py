@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.reading import read_lines
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.sequences.bags.bag_file import is_bag
 from bmask_slam.sequences.bags.bag_recording import open_bag_recording
@@ -50,7 +51,8 @@ FOLDERS = (
     Layout(is_open3d, open_open3d),
     Layout(is_polycam, open_polycam),
 )
-"""Folders other than TUM's, in the order in which they are tried."""
+"""Folders other than TUM's, in the order in which they are tried. TUM's lists win over all but
+ICL-NUIM."""
 FILES = (Layout(is_sens, open_sens), Layout(is_r3d, open_r3d))
 _LISTS = ("rgb.txt", "depth.txt", "associations.txt")
 
@@ -81,9 +83,19 @@ def open_recording(path: Path, camera: Given = None) -> Recording:
             "another layout of docs/data.md"
         )
     for layout in FOLDERS:
-        if layout.is_one(path):
+        if layout.is_one(path) and (layout.open is open_icl_nuim or not _has_lists(path)):
             return layout.open(path, camera)
     return _open_tum(path, camera)
+
+
+def _has_lists(folder: Path) -> bool:
+    """Whether it has a list of TUM's; associations.txt is one by the four columns of a line."""
+    if any((folder / name).is_file() for name in _LISTS[:2]):
+        return True
+    path = folder / _LISTS[2]
+    rows = read_lines(path, "restore it") if path.is_file() else iter(())
+    _, first = next(rows, (0, ""))
+    return len(first.split()) == 4
 
 
 def _open_tum(folder: Path, given: Given) -> Recording:

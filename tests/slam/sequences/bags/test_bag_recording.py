@@ -32,6 +32,20 @@ def test_frames_are_read_in_any_order(tmp_path: Path, name: str, monkeypatch) ->
         assert np.array_equal(frame.depth_m, expected.depth_m, equal_nan=True)
 
 
+@pytest.mark.parametrize("begin_s", [0.0, 1.0])
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap", "folder"])
+def test_a_clock_may_begin_at_zero(tmp_path: Path, name: str, begin_s: float) -> None:
+    with BagMaker(tmp_path / name, begin_s=begin_s) as bag:
+        bag.write("/camera/rgb/camera_info", begin_s, info_of(COLOUR))
+        for k in range(2):
+            bag.write("/camera/rgb/image_color", begin_s + k, image("rgb8", colour(k)))
+            depth = image("16UC1", np.full((24, 32), 1500, np.uint16))
+            bag.write("/camera/depth/image", begin_s + k, depth)
+    sequence = open_sequence(tmp_path / name)
+    for k in (0, 1, 0):
+        assert np.array_equal(sequence.load(k).rgb, colour(k))
+
+
 def info_of(camera) -> object:
     info = camera_info((0.0,) * 5)
     info.width, info.height, info.k = camera.width, camera.height, camera.K.ravel()

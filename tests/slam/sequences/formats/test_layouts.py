@@ -19,11 +19,19 @@ from small_layouts import (
     hole,
     raw_lzfse,
     write_small,
+    write_tum,
 )
 
 from bmask_slam.cli import main
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import (
+    make_pose,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    se3_exp,
+)
 from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.sequences.formats.convert import convert
 from bmask_slam.sequences.formats.lzfse import unpack_lzfse
 
 
@@ -105,6 +113,68 @@ def test_stamps_out_of_order_and_repeated_ones_are_counted(tmp_path: Path, caplo
     assert len(sequence) == FRAMES
     assert (sequence.recording.rgb.unordered, sequence.recording.rgb.repeated) == (1, 1)
     assert "1 stamps out of order were sorted, 1 repeated ones left out" in caplog.text
+
+
+@pytest.mark.parametrize("lists", ["rgb.txt and depth.txt", "rgb.txt", "associations.txt"])
+@pytest.mark.parametrize("other", SMALL_LAYOUTS, ids=lambda layout: layout.name)
+def test_the_lists_of_tum_win(other: SmallLayout, lists: str, tmp_path: Path) -> None:
+    if Path(other.file).suffix or other.name == "ICL-NUIM":
+        return
+    folder = write_small(other, tmp_path)
+    write_tum(folder)
+    if "depth.txt" not in lists:
+        (folder / "depth.txt").unlink()
+    if lists == "associations.txt":
+        (folder / "rgb.txt").unlink()
+        text = "# colour depth\n" + "".join(
+            f"{k} rgb/{k}.png {k} depth/{k}.png\n" for k in range(3)
+        )
+        (folder / lists).write_text(text)
+    if lists == "rgb.txt":
+        with pytest.raises(InputError, match=r"depth\.txt: no such list"):
+            open_sequence(folder)
+    else:
+        assert open_sequence(folder).recording.layout == "TUM"
+
+
+def test_other_associations_are_no_list_of_tum(tmp_path: Path) -> None:
+    folder = write_small(SMALL_LAYOUTS[7], tmp_path)
+    (folder / "associations.txt").write_text("0 0\n1 1\n")
+    assert open_sequence(folder).recording.layout == "Open3D"
+
+
+def test_truth_of_markers_is_moved_to_the_camera(tmp_path: Path) -> None:
+    folder = write_small(SMALL_LAYOUTS[6], tmp_path)
+    T_body_markers = se3_exp(np.array([0.3, -0.2, 0.5, 0.2, -0.1, 0.4]))
+    expected = open_sequence(folder).groundtruth.poses_world_camera
+    body, markers = folder / "mav0/state_groundtruth_estimate0", folder / "mav0/vicon0"
+    body.rename(markers)
+    said = f"T_BS: {{cols: 4, rows: 4, data: {T_body_markers.ravel().tolist()}}}"
+    (markers / "sensor.yaml").write_text(said)
+    table = np.loadtxt(markers / "data.csv", delimiter=",")
+    T_world_body = make_pose(rotation_from_quaternion(table[:, [5, 6, 7, 4]]), table[:, 1:4])
+    rows = []
+    for stamp_ns, T in zip(table[:, 0], T_world_body @ T_body_markers, strict=True):
+        x, y, z, w = quaternion_from_rotation(T[:3, :3])
+        rows.append(",".join(map(str, [int(stamp_ns), *T[:3, 3], w, x, y, z])))
+    (markers / "data.csv").write_text("\n".join(rows))
+    assert np.allclose(open_sequence(folder).groundtruth.poses_world_camera, expected, atol=1e-6)
+
+
+def test_files_of_sensors_are_converted_too(tmp_path: Path, caplog) -> None:
+    folder, out = write_small(SMALL_LAYOUTS[7], tmp_path), tmp_path / "out"
+    carried = {"imu.csv": b"#t\n1,2\n", "odometry.txt": b"a", "accelerometer.txt": b"\xff\r\n"}
+    for name, data in carried.items():
+        (folder / name).write_bytes(data)
+    (folder / "position.txt").symlink_to(folder / "imu.csv")
+    (folder / "right.txt").write_text("0 a.png")
+    with caplog.at_level(logging.WARNING):
+        done = convert(folder, out)
+    assert {name: (out / name).read_bytes() for name in done.copied} == carried
+    assert "imu.csv" in str(done)
+    for name in ("position.txt", "right.txt"):
+        assert f"not carried over: {folder / name}" in caplog.text
+        assert not (out / name).exists()
 
 
 def test_a_camera_yaml_wins(tmp_path: Path) -> None:
