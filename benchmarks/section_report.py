@@ -59,6 +59,9 @@ REPORTS = {
             "{sequences}/results/corridor-no-loop-closed --reference {sequences}/corridor",
         ),
         "rounds": ("Round after round", "loops.corridor_rounds --out {sequences}/rounds"),
+        "pose-graph-times": (
+            "Pose graphs, time beside plain GTSAM", "graph.pose_graphs --methods lm --seeds 0"
+        ),
         "pose-graphs": ("Pose graphs, clean and with wrong loops", "graph.pose_graphs"),
         "kills": (
             "Killed and resumed",

@@ -1,6 +1,7 @@
 """A second process on a DDS domain: plays a moving camera before a plane, and keeps what it hears.
 
-Arguments: domain, frames, rate in Hz, file for the received messages (JSON).
+Arguments: domain, rate in Hz, file for the received messages (JSON). Frames that are dropped do not
+matter: the camera goes to and fro until nobody listens any more.
 """
 
 from __future__ import annotations
@@ -30,11 +31,17 @@ HEARD = {
 }
 BEGIN_S = 1000.0
 LONGEST_S = 120.0
+PLACES = 10
+
+
+def place(k: int) -> int:
+    """Which of the PLACES frame k is taken from, to and fro."""
+    return abs((k + PLACES - 1) % (2 * PLACES - 2) - (PLACES - 1))
 
 
 def pose(k: int) -> np.ndarray:
     """T_world_camera of a frame: sideways, and a turn."""
-    return se3_exp(np.array([0, 0.01 * k, 0, 0.02 * k, 0, 0]))
+    return se3_exp(place(k) * np.array([0, 0.01, 0, 0.02, 0, 0]))
 
 
 def image(stamp_s: float, encoding: str, pixels: np.ndarray) -> object:
@@ -58,9 +65,8 @@ def info(stamp_s: float) -> object:
 
 
 def main() -> None:
-    """Play the frames, then listen until nothing has come for two seconds."""
-    domain, frames = int(sys.argv[1]), int(sys.argv[2])
-    rate_hz, out = float(sys.argv[3]), sys.argv[4]
+    """Play frames until nothing has come for four seconds since the first pose."""
+    domain, rate_hz, out = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
     node = Node(domain)
     image_type = "sensor_msgs/msg/Image"
     colours = node.writer(COLOUR, image_type, SENSOR._replace(reliable=True))
@@ -68,7 +74,7 @@ def main() -> None:
     infos = node.writer(INFO, "sensor_msgs/msg/CameraInfo", SENSOR._replace(reliable=True))
     readers = {t: node.reader(t, type_name(k), q) for t, (k, q) in HEARD.items()}
     heard: dict[str, list] = {topic: [] for topic in HEARD}
-    rendered = [render_plane(pose(k), k) for k in range(frames)]
+    rendered = [render_plane(pose(k), k) for k in range(PLACES)]
     k, last_s = 0, time.monotonic()
     end_s = last_s + LONGEST_S
     while time.monotonic() < min(last_s + 4, end_s):
@@ -76,12 +82,13 @@ def main() -> None:
             for received in reader.take():
                 heard[topic].append(told(received))
                 last_s = time.monotonic()
-        if k < frames:  # the first is repeated until somebody tracks: a camera is there before
-            stamp_s = BEGIN_S + k / 30
-            infos.send(info(stamp_s))
-            colours.send(image(stamp_s, "rgb8", rendered[k].rgb))
-            depths.send(image(stamp_s, "32FC1", rendered[k].depth_m.astype(np.float32)))
-            k += bool(heard["/tf"])
+        stamp_s, frame = BEGIN_S + k / 30, rendered[place(k)]
+        infos.send(info(stamp_s))
+        colours.send(image(stamp_s, "rgb8", frame.rgb))
+        depths.send(image(stamp_s, "32FC1", frame.depth_m.astype(np.float32)))
+        if heard["/tf"]:
+            k += 1
+        else:  # the first is repeated until somebody tracks: a camera is there before
             last_s = time.monotonic()
         time.sleep(1 / rate_hz)
     Path(out).write_text(json.dumps(heard))

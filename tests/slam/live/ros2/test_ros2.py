@@ -124,7 +124,7 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
     helpers = Path(__file__).parents[3] / "helpers"
     path = os.pathsep.join([str(helpers), *filter(None, sys.path)])
-    words = [sys.executable, helpers / "ros2_player.py", DOMAIN, FRAMES, 10, tmp_path / "heard"]
+    words = [sys.executable, helpers / "ros2_player.py", DOMAIN, 10, tmp_path / "heard"]
     with subprocess.Popen(list(map(str, words)), env={**os.environ, "PYTHONPATH": path}) as player:
         out = tmp_path / "run"
         options = ("--segmenter", "none", "--calibrate", "off", "--quiet", "--silence", "30")
