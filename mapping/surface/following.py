@@ -99,12 +99,7 @@ class FollowingSurface:
         """
         gone = [n for n in removed if n in self._parts]
         known = {n: T for n, T in poses.items() if n in self._parts and n not in gone}
-        least_m = self.volume.voxel_m
-        moved = {
-            n: T
-            for n, T in known.items()
-            if displacement_m(self._parts[n].T_world_camera, T) > least_m
-        }
+        moved = {n: T for n, T in known.items() if self._has_moved(n, T)}
         if not moved and not gone:
             return 0
         stale = torch.zeros(len(self.volume), dtype=torch.bool)
@@ -123,9 +118,15 @@ class FollowingSurface:
             elif number in moved:
                 self.add(number, frame)
             else:
+                grown = len(self.volume) - len(stale)  # blocks made by frames that moved
+                stale = torch.nn.functional.pad(stale, (0, grown))
                 self.volume.integrate(frame, stale)
             read += 1
         return read
+
+    def _has_moved(self, number: int, T_world_camera: Array) -> bool:
+        was = self._parts[number].T_world_camera
+        return displacement_m(was, T_world_camera) > self.volume.voxel_m
 
     def save(self, path: Path, made_of: Header) -> None:
         """Write which frames are in the kept volume of this folder, and of what they are made.

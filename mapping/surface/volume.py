@@ -190,7 +190,8 @@ class SurfaceVolume:
         """Colours (N, 3) of the voxels at points (N, 3), and their weights: (N, 4)."""
         keys, row = voxel_places(torch.floor(points_world / self.voxel_m + 0.5).to(torch.int64))
         keys, which = torch.unique(keys, return_inverse=True)
-        number = torch.tensor([self._number.get(k, -1) for k in keys.tolist()])[which]
+        numbers = [self._number.get(k, -1) for k in keys.tolist()]
+        number = torch.tensor(numbers, dtype=torch.int64)[which]
         row += number.clamp(min=0) * (BRICKS * BRICK_VOXELS)
         return self.colour.view(-1, 4)[row].to(torch.float32) * (number >= 0)[:, None]
 

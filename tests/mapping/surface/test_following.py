@@ -98,6 +98,32 @@ def test_a_removed_frame_leaves_no_trace() -> None:
     assert left.views.max() == 4  # of those that look back
 
 
+def test_a_moved_frame_may_make_blocks_in_view_of_others() -> None:
+    """It comes to look as if there were a wall 1 m nearer, in front of the other's."""
+    surface = FollowingSurface(SurfaceVolume(VOXEL_M, CAMERA), seen_from)
+    for number in (0, 1):
+        surface.add(number, seen_from(number, TRUE[number]))
+    before, nearer = len(surface.volume), TRUE[0].copy()
+    nearer[2, 3] -= 1.0
+    assert surface.follow({0: nearer, 1: TRUE[1]}) == 2
+    assert len(surface.volume) > before
+    left = extract(surface.volume, 1).vertices[:, 2]
+    assert np.mean(np.abs(left - WALL_M) < 0.01) > 0.4
+
+
+def test_a_frame_without_depth_changes_nothing() -> None:
+    surface = FollowingSurface(SurfaceVolume(VOXEL_M, CAMERA), seen_from)
+    nothing, rgb = as_map(np.full((30, 40), np.nan), 0.002), np.zeros((30, 40, 3), np.uint8)
+    empty = depth_frame(nothing, rgb, TRUE[1], CAMERA, VOXEL_M)
+    surface.add(1, empty)
+    assert len(surface.volume) == 0
+    surface.add(0, seen_from(0, TRUE[0]))
+    surface.add(2, empty)
+    expected = scratch({0: TRUE[0]})
+    for name, values in vars(extract(surface.volume)).items():
+        np.testing.assert_array_equal(values, getattr(expected, name))
+
+
 def test_a_turn_moves_what_is_far_away() -> None:
     c, s = np.cos(0.1), np.sin(0.1)
     turned = make_pose(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]), np.zeros(3))
