@@ -60,7 +60,7 @@ class FileTable:
         """Let the table have so many rows; new ones are zero. Raises InputError: no space."""
         size = rows * self._kind.itemsize * int(np.prod(self._shape))
         with _disk():
-            os.posix_fallocate(self._file.fileno(), 0, size)  # a full disk would kill the process
+            _take_space(self._file, size)
             self._map = mmap.mmap(self._file.fileno(), size)
         values = np.frombuffer(self._map, self._kind).reshape(rows, *self._shape)
         self.rows = torch.from_numpy(values)
@@ -78,6 +78,27 @@ class FileTable:
 def open_tables(folder: Path | None, kept: bool) -> dict[str, FileTable]:
     """The TABLES of a volume by name, in files that have these names if they are kept."""
     return {name: FileTable(*kind, folder, name if kept else None) for name, kind in TABLES.items()}
+
+
+def tables_fit(folder: Path, blocks: int) -> bool:
+    """Whether the kept files in a folder are as large as so many blocks need."""
+    return all(
+        (folder / name).is_file()
+        and (folder / name).stat().st_size
+        == blocks * BRICKS * int(np.prod(shape)) * np.dtype(KINDS[kind]).itemsize
+        for name, (shape, kind) in TABLES.items()
+    )
+
+
+def _take_space(file: IO[bytes], size: int) -> None:
+    """Make a file that large, on the disk too: later a full one would kill the process."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file.fileno(), 0, size)
+        return
+    held = file.seek(0, os.SEEK_END)  # macOS
+    for start in range(held, size, 1 << 20):
+        file.write(bytes(min(size - start, 1 << 20)))
+    file.flush()
 
 
 def _opened(folder: Path | None, name: str | None) -> IO[bytes]:

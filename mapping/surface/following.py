@@ -21,6 +21,7 @@ from bmask_slam.graph.files.array_file import (
     write_arrays,
 )
 from bmask_slam.graph.geometry import transform
+from bmask_slam.mapping.surface.blocks import tables_fit
 from bmask_slam.mapping.surface.depth_frame import DepthFrame
 from bmask_slam.mapping.surface.volume import SurfaceVolume
 
@@ -166,9 +167,28 @@ def read_kept(path: Path, made_of: Header) -> Arrays | None:
     except InputError:
         return None
     path.unlink()
+    if header.get("made_of") != made_of or not tables_fit(path.parent, len(arrays["keys"])):
+        return None
     total = arrays["sizes"].sum() == len(arrays["packed"]) and (arrays["sizes"] >= 0).all()
     alike = len(arrays["numbers"]) == len(arrays["poses"]) == len(arrays["sizes"])
-    return arrays if total and alike and header.get("made_of") == made_of else None
+    sound = np.isfinite(arrays["poses"]).all() and len(np.unique(arrays["keys"])) == len(
+        arrays["keys"]
+    )
+    return arrays if total and alike and sound and _are_packed(arrays) else None
+
+
+def _are_packed(arrays: Arrays) -> bool:
+    """Whether each frame's bits can be unpacked, and are not more than the blocks."""
+    packed, most = arrays["packed"].tobytes(), -(-len(arrays["keys"]) // 8)
+    for size, end in zip(arrays["sizes"], np.cumsum(arrays["sizes"]), strict=True):
+        unpacker = zlib.decompressobj()
+        try:
+            bits = unpacker.decompress(packed[end - size : end], most + 1)
+        except zlib.error:
+            return False
+        if len(bits) > most or not unpacker.eof:
+            return False
+    return True
 
 
 def displacement_m(T_world_a: Array, T_world_b: Array) -> float:

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from surface_scene import CAMERA, as_map, plane_rho, poses
 
 from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.files.array_file import write_arrays
 from bmask_slam.graph.geometry import make_pose
 from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame
 from bmask_slam.mapping.surface.extraction import Surface, extract
-from bmask_slam.mapping.surface.following import FollowingSurface, displacement_m, read_kept
+from bmask_slam.mapping.surface.following import (
+    VOLUME_FILE,
+    FollowingSurface,
+    displacement_m,
+    read_kept,
+)
 from bmask_slam.mapping.surface.volume import SurfaceVolume
 
 VOXEL_M, WALL_M, ERROR_M = 0.05, 2.0, 0.1
@@ -159,6 +167,42 @@ def test_memory_that_was_given_back_is_read_again() -> None:
     other = scratch(TRUE)
     for name, values in vars(extract(volume)).items():
         np.testing.assert_array_equal(values, getattr(other, name))
+
+
+def test_a_kept_volume_that_is_not_whole_is_not_used(tmp_path: Path) -> None:
+    path = tmp_path / "index"
+    kept = SurfaceVolume(VOXEL_M, CAMERA, folder=tmp_path, kept=np.zeros(0, np.int64))
+    before = FollowingSurface(kept, seen_from)
+    before.add(0, seen_from(0, TRUE[0]))
+    before.save(path, {})
+    good = read_kept(path, {})
+    assert good is not None
+    bomb = np.frombuffer(zlib.compress(bytes(10_000_000)), np.uint8)
+    broken = [
+        {"keys": np.zeros_like(good["keys"])},
+        {"poses": good["poses"] * np.nan},
+        {"packed": good["packed"][::-1]},
+        {"packed": good["packed"][:-2], "sizes": good["sizes"] - 2},
+        {"packed": bomb, "sizes": np.array([len(bomb)])},
+    ]
+    for wrong in broken:
+        write_arrays(path, VOLUME_FILE, {"made_of": {}}, {**good, **wrong})
+        assert read_kept(path, {}) is None
+    write_arrays(path, VOLUME_FILE, {"made_of": {}}, good)
+    assert read_kept(path, {}) is not None
+    for change in (lambda: (tmp_path / "weight").write_bytes(b""), (tmp_path / "weight").unlink):
+        change()
+        write_arrays(path, VOLUME_FILE, {"made_of": {}}, good)
+        assert read_kept(path, {}) is None
+
+
+def test_tables_grow_where_the_system_cannot_allocate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on macOS."""
+    monkeypatch.delattr("os.posix_fallocate")
+    volume = SurfaceVolume(VOXEL_M, CAMERA, blocks=8)
+    volume.integrate(seen_from(0, TRUE[0]))
+    monkeypatch.undo()
+    np.testing.assert_array_equal(extract(volume).vertices, scratch({0: TRUE[0]}).vertices)
 
 
 def test_a_kept_volume_is_followed_from_where_it_was(tmp_path: Path) -> None:
