@@ -73,6 +73,8 @@ def write_products(
     cloud = _labelled(surface, views, table, frames_a_keyframe(fused))
     kept = ~np.isin(cloud.labels, [fused.labels.number(n) for n in fused.options.excluded or ()])
     surface, cloud = surface.select(kept), cloud.select(kept)
+    if not len(cloud):
+        raise InputError(f"{fused.run.path}: no surface: all of it is of excluded classes")
     names, folder = table.stuff_fusion.names, fused.folder
     written = _write_clouds(fused, cloud, names)
     if fused.options.mesh:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shutil
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,10 +16,11 @@ from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.keyframe_input import MAX_STAMP_ERROR_S, undistort_images
 from bmask_slam.dense.options import MapOptions, fusion_config
 from bmask_slam.dense.saved_map import MappedRun, SavedMap
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.trajectory import nearest_indices, read_tum
+from bmask_slam.graph.whole_file import remove
 from bmask_slam.mapping.inverse_depth.depth_map import from_sensor
 from bmask_slam.mapping.inverse_depth.regularisation import regularise
 from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame, mark_unexplained
@@ -95,10 +95,7 @@ class _SurfaceMaker:
         self._keyframes = {-1 - k.id: k for k in fused.keyframes()}
         self._folder = fused.folder.path / VOLUME
         refuse_link(self._folder)
-        arrays = read_kept(self._folder / INDEX, self._made_of()) if self._kept else None
-        if self._kept and arrays is None:
-            shutil.rmtree(self._folder, ignore_errors=True)
-            self._folder.mkdir()
+        arrays = read_or_clear(self._folder, self._made_of()) if self._kept else None
         keys = np.zeros(0, np.int64) if arrays is None else arrays["keys"]
         volume = self._volume(self._folder, keys) if self._kept else self._volume()
         self._surface = FollowingSurface(volume, self._load)
@@ -189,6 +186,25 @@ class _SurfaceMaker:
         frame = depth_frame(measured, rgb, T_world_camera, run.camera, options.voxel_m)
         mark_unexplained(frame, verdict.unexplained)
         return frame
+
+
+def read_or_clear(folder: Path, made_of: dict[str, Any]) -> Arrays | None:
+    """What ``read_kept`` finds in a folder of a volume; if nothing, an empty folder is made there.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    try:
+        arrays = read_kept(folder / INDEX, made_of)
+        if arrays is None:
+            remove(folder)
+            folder.mkdir()
+    except OSError as error:
+        raise InputError(
+            f"{folder}: cannot be written ({error.strerror}); free some space, or change its "
+            "permissions"
+        ) from error
+    return arrays
 
 
 def tracked_frames(run: MappedRun) -> list[tuple[int, Array]]:

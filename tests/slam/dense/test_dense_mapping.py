@@ -285,6 +285,24 @@ def test_a_kept_volume_reads_only_what_moved(
     assert np.quantile(cKDTree(expected).query(off)[0], 0.95) > 0.01
 
 
+def test_a_volume_that_is_no_folder_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import bmask_slam.dense.surface as module
+
+    path = tmp_path / "volume"
+    path.write_text("no folder")
+    assert module.read_or_clear(path, {}) is None
+    assert path.is_dir()
+
+    def refuse(path: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(module, "remove", refuse)
+    with pytest.raises(InputError, match="Permission denied"):
+        module.read_or_clear(path, {})
+
+
 def test_a_run_can_fuse_keyframes_while_tracking(
     room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
