@@ -206,7 +206,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
             RunCounters(tracking_ms=tracking_ms, **header["tally"]),
             part(arrays, "system"),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(
             f"{path}: its header cannot be read ({error}); start the run again"
         ) from error

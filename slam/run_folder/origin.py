@@ -60,7 +60,10 @@ def _may_be_sequence(folder: Path) -> bool:
 def _is_there(sequence: Path) -> bool:
     """Whether a folder or a file that is a recording lies there; topics may follow a bag's path."""
     file, _ = split_path(sequence)
-    return is_folder(file) or (is_recording_file(sequence) and file.is_file())
+    try:
+        return is_folder(file) or (is_recording_file(sequence) and file.is_file())
+    except OSError:  # no name that a file can have
+        return False
 
 
 def find_sequence(run: Path) -> Path:

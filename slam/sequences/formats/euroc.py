@@ -65,7 +65,10 @@ def _images(folder: Path) -> ImageList:
     for number, line in read_lines(path, "restore it"):
         stamp, _, name = line.partition(",")
         if name.strip():
-            stamps_s += [numbers_in(stamp, f"{path}:{number}")[0] * NANOSECONDS]
+            numbers = numbers_in(stamp, f"{path}:{number}")
+            if len(numbers) != 1:
+                raise InputError(f"{path}:{number}: {stamp[:80]!r} is no stamp in nanoseconds")
+            stamps_s += [numbers[0] * NANOSECONDS]
             files.append(folder / "data" / check_name(name.strip(), f"{path}:{number}"))
     if not files or not np.isfinite(stamps_s).all():
         raise InputError(f"{path}: no lines of 'nanoseconds,file', or a stamp without end")

@@ -268,6 +268,8 @@ def test_a_foreign_checkpoint_is_refused(begun: Path, refused) -> None:
     rewrite(counters={})
     rewrite(options={"sequence": "x"})
     refused(r"out/checkpoint: its header cannot be read")
+    rewrite(frames_bytes=float("inf"))
+    refused(r"out/checkpoint: its header cannot be read")
     rewrite(version=99)
     refused(r"out/checkpoint: holds 'bmask-slam checkpoint' version 99, expected")
     rewrite(format="bmask-slam map")

@@ -57,3 +57,9 @@ def test_a_live_run_and_a_missing_configuration_name_no_sequence(run) -> None:
     (run / "config.yaml").write_text(f"# {Origin(None)}\n{{}}\n")
     with pytest.raises(InputError, match="names no sequence"):
         find_sequence(run)
+
+
+def test_a_sequence_with_a_name_that_no_file_can_have_is_not_there(run: Path) -> None:
+    write(run, "/" + "nowhere" * 60 + ".mcap")
+    with pytest.raises(InputError, match="which is not there"):
+        find_sequence(run)

@@ -31,6 +31,7 @@ from bmask_slam.graph.geometry import (
     se3_exp,
 )
 from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.sequences.formats import euroc
 from bmask_slam.sequences.formats.convert import convert
 from bmask_slam.sequences.formats.lzfse import unpack_lzfse
 
@@ -231,3 +232,12 @@ def test_what_is_none_is_refused(tmp_path: Path) -> None:
     (tmp_path / "intrinsic.json").write_text(json.dumps({"width": COLOUR.width}))
     with pytest.raises(InputError, match="none of the other layouts"):
         open_sequence(tmp_path)
+
+
+@pytest.mark.parametrize("line", [",0.png", "1 2,0.png"])
+def test_a_line_of_euroc_without_a_stamp_is_named(tmp_path: Path, line: str) -> None:
+    folder = tmp_path / "cam0"
+    folder.mkdir()
+    (folder / "data.csv").write_text(f"# stamp,name\n{line}\n")
+    with pytest.raises(InputError, match=r"data\.csv:2: .*no stamp in nanoseconds"):
+        euroc._images(folder)
