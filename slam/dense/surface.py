@@ -120,10 +120,12 @@ class _SurfaceMaker:
         if read:
             logger.info("%d frames and keyframes were integrated again", read)
         new = {n: T for n, T in frames.items() if n not in surface}
-        for number, frame in self._prepared(new):
+        handled = len(poses) - len(new)
+        progress(handled, len(poses))
+        for done, (number, frame) in enumerate(self._prepared(new), handled + 1):
             if frame is not None:
                 surface.add(number, frame)
-            progress(len(surface), len(poses))
+            progress(done, len(poses))
         found = extract(surface.volume, MIN_WITNESSES if frames else 1)
         if self._kept:
             surface.save(self._folder / INDEX, self._made_of())

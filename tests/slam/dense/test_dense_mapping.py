@@ -270,7 +270,9 @@ def test_a_kept_volume_reads_only_what_moved(
         options = MapOptions(run, voxel_m=0.05, keep_volume=keep)
         caplog.clear()
         with caplog.at_level(logging.INFO):
-            found = make_surface(FusedMap(opened, labels, DenseFolder.open(run), options))
+            fused, seen = FusedMap(opened, labels, DenseFolder.open(run), options), []
+            found = make_surface(fused, lambda done, total: seen.append(total - done))
+        assert seen[-1] == 0
         return found.vertices.astype(float), [m for m in caplog.messages if "again" in m]
 
     off, messages = surface_with(drifted, True)
