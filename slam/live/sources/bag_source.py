@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.live.sources.message_frames import message_frames
 from bmask_slam.live.sources.pairing import DEPTH, RGB, Pair, Pairer
 from bmask_slam.live.sources.source import SourceCounts, paced
 from bmask_slam.sequences.bags.bag_file import open_bag
-from bmask_slam.sequences.bags.ros_images import colour_image, depth_image, stamp_s
+from bmask_slam.sequences.bags.ros_images import stamp_s
 from bmask_slam.sequences.bags.topics import BagTopics, find_camera, find_topics
-from bmask_slam.sequences.checks import check_sizes
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.sequences.images import depth_in_metres
-
-logger = logging.getLogger(__name__)
 
 
 class BagSource:
@@ -61,20 +56,8 @@ class BagSource:
         """Nothing to release: ``frames`` opens and closes the bag."""
 
     def _frames(self) -> Iterator[Frame]:
-        index = 0
-        for pair in self._pairs():
-            try:
-                rgb = colour_image(pair.rgb, f"{self._topics.rgb} at {pair.stamp_s:.6f}")
-                stored = depth_image(pair.depth, f"{self._topics.depth} at {pair.stamp_s:.6f}")
-                where = f"{self._path} at {pair.stamp_s:.6f}"
-                check_sizes(rgb, stored, self.camera, where, self._form.camera)
-            except InputError as error:
-                self.counts.broken += 1
-                logger.warning("skipped: %s", error)
-                continue
-            depth_m = depth_in_metres(self._form.on_colour(stored, self.camera), self.camera)
-            yield Frame(index, pair.stamp_s, rgb, depth_m, depth_lag_s=pair.lag_s)
-            index += 1
+        names = (self._topics.rgb, self._topics.depth, str(self._path))
+        return message_frames(self._pairs(), self.camera, self._form, self.counts, names)
 
     def _pairs(self) -> Iterator[Pair[Any]]:
         pairer = Pairer[Any](self.counts, self.camera.depth_time_offset_s)

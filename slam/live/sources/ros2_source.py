@@ -12,19 +12,18 @@ from typing import Any
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.ros2.dds import LATCHED, SENSOR, STATE, Node, Reader
+from bmask_slam.live.sources.message_frames import message_frames
 from bmask_slam.live.sources.pairing import DEPTH, RGB, Pair, Pairer
 from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.sequences.bags.bag_file import INFO_TYPE, Topic
-from bmask_slam.sequences.bags.ros_images import colour_image, depth_image, stamp_s
+from bmask_slam.sequences.bags.ros_images import stamp_s
 from bmask_slam.sequences.bags.topics import (
     TRANSFORMS,
     BagTopics,
     find_camera,
     find_topics,
 )
-from bmask_slam.sequences.checks import check_sizes
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.sequences.images import depth_in_metres
 
 logger = logging.getLogger(__name__)
 
@@ -113,20 +112,8 @@ class Ros2Source:
         Raises:
             InputError: none came for ``silence_s``.
         """
-        index = 0
-        for pair in self._pairs():
-            where = f"{self._where} at {pair.stamp_s:.6f}"
-            try:
-                rgb = colour_image(pair.rgb, where).copy()
-                stored = depth_image(pair.depth, where)
-                check_sizes(rgb, stored, self.camera, where, self._form.camera)
-            except InputError as error:
-                self.counts.broken += 1
-                logger.warning("skipped: %s", error)
-                continue
-            depth_m = depth_in_metres(self._form.on_colour(stored, self.camera), self.camera)
-            yield Frame(index, pair.stamp_s, rgb, depth_m, depth_lag_s=pair.lag_s)
-            index += 1
+        names = (self._where,) * 3
+        return message_frames(self._pairs(), self.camera, self._form, self.counts, names)
 
     def close(self) -> None:
         """End ``frames`` soon; may be called from any thread."""
