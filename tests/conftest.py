@@ -94,12 +94,12 @@ SWEEP_DELAY_S = 0.016
 
 @pytest.fixture(scope="session")
 def late_sweep(rendered: Callable[[RenderConfig], Path]) -> Path:
-    """Ten seconds of the office by a sweeping camera; depth is late, which camera.yaml omits."""
+    """Eight seconds of the office by a sweeping camera; depth is late, which camera.yaml omits."""
     from bmask_slam.rendering.sequence import RenderConfig
 
     late_ms = 1e3 * SWEEP_DELAY_S
     config = RenderConfig(
-        "office", 150, fps=15.0, width=320, height=240, sweeping=True, depth_delay_ms=late_ms
+        "office", 125, fps=15.0, width=320, height=240, sweeping=True, depth_delay_ms=late_ms
     )
     return rendered(config)
 

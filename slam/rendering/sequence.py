@@ -27,7 +27,7 @@ from bmask_slam.rendering.annotations import (
 from bmask_slam.rendering.engine.builder import SceneBuilder
 from bmask_slam.rendering.engine.lighting import Lighting
 from bmask_slam.rendering.engine.path import CameraPath, camera_poses
-from bmask_slam.rendering.engine.raycast import Renderer, View, to_image
+from bmask_slam.rendering.engine.raycast import Geometry, Renderer, View, to_image
 from bmask_slam.rendering.engine.scene import Scene, build_scene
 from bmask_slam.rendering.engine.sensor import blur, exposure_gain, measure_depth, optical_flow
 from bmask_slam.rendering.rooms.random_room import draw_room
@@ -258,31 +258,32 @@ def _draw_all(job: _Job) -> Iterator[list[VisibleInstance]]:
 def _draw(job: _Job, i: int) -> list[VisibleInstance]:
     """Draw, disturb and write frame ``i``: a function of the configuration and ``i`` alone."""
     time_s = i / job.config.fps
-    view = _view(job, job.poses[i], time_s)
+    view = job.renderer.render(job.poses[i], _moving(job, time_s))
     rng = np.random.default_rng([job.config.seed, 3, i])
     rgb = _exposed(job, i, view, rng)
-    depth_view = view
+    true_m, normals = view.depth_m, view.normals
     if job.config.depth_delay_ms:
-        depth_view = _view(job, job.depth_poses[i], time_s + job.config.depth_delay_ms / 1e3)
-    depth_m = depth_view.depth_m
+        delayed_s = time_s + job.config.depth_delay_ms / 1e3
+        moving = _moving(job, delayed_s)
+        true_m, normals = job.renderer.render_depth(job.depth_poses[i], moving)
+    depth_m = true_m
     if job.config.noise:
-        depth_m = measure_depth(depth_view.depth_m, depth_view.normals, job.camera, rng)
+        depth_m = measure_depth(true_m, normals, job.camera, rng)
     name = f"{job.stamps[i]}.png"
     write_png(job.folder / "rgb" / name, rgb)
     write_png(job.folder / "depth" / name, stored_depth(depth_m, job.camera.depth_scale))
     write_png(job.folder / "instances" / name, view.instances)
     if job.config.true_depth:
-        true = stored_depth(depth_view.depth_m, job.camera.depth_scale)
-        write_png(job.folder / "depth_true" / name, true)
+        stored = stored_depth(true_m, job.camera.depth_scale)
+        write_png(job.folder / "depth_true" / name, stored)
     if job.config.normals:
         write_png(job.folder / "normals" / name, to_image(127.5 * view.normals + 127.5))
     return visible_instances(view.instances)
 
 
-def _view(job: _Job, T_world_camera: Array, time_s: float) -> View:
-    """The view of a perfect camera at this pose and time."""
-    moving = job.cast.geometry(time_s, job.scene) if job.cast.parts else None
-    return job.renderer.render(T_world_camera, moving)
+def _moving(job: _Job, time_s: float) -> Geometry | None:
+    """What moves, where it is at this time."""
+    return job.cast.geometry(time_s, job.scene) if job.cast.parts else None
 
 
 def _exposed(job: _Job, i: int, view: View, rng: np.random.Generator) -> Image:

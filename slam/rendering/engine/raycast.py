@@ -94,21 +94,36 @@ class Renderer:
     def render(self, T_world_camera: Array, moving: Geometry | None = None) -> View:
         """Draw one view; rays go through pixel centres, edges of things are supersampled."""
         h, w = self._camera.height, self._camera.width
-        layers = [self._static] + ([moving] if moving is not None else [])
-        tables = _stack(layers)
-        t, triangle, rays = self._cast(layers, self._pixels, T_world_camera)
-        hit = triangle >= 0
-        colour, normals = self._shade(tables, (t, triangle, rays), T_world_camera)
-        surface = tables[1][triangle].reshape(h, w)
-        edges = _edges(surface, t.reshape(h, w), colour.reshape(h, w, 3)).ravel()
+        layers, tables = _stack(self._static, moving)
+        hits = self._cast(layers, self._pixels, T_world_camera)
+        colour = self._shade(tables, hits, T_world_camera)
+        surface = tables[1][hits[1]].reshape(h, w)
+        edges = _edges(surface, hits[0].reshape(h, w), colour.reshape(h, w, 3)).ravel()
         colour[edges] = self._supersample(layers, tables, self._pixels[edges], T_world_camera)
-        instances = np.where(hit, tables[2][triangle], 0).astype(np.uint16)
-        depth = np.where(hit, t, np.nan).astype(np.float32)
-        normals = normals @ T_world_camera[:3, :3].astype(np.float32)
+        instances = np.where(hits[1] >= 0, tables[2][hits[1]], 0).astype(np.uint16)
         return View(
-            colour.reshape(h, w, 3), depth.reshape(h, w),
-            normals.reshape(h, w, 3), instances.reshape(h, w),
+            colour.reshape(h, w, 3), *self._geometry(tables, hits, T_world_camera),
+            instances.reshape(h, w),
         )  # fmt: skip
+
+    def render_depth(
+        self, T_world_camera: Array, moving: Geometry | None = None
+    ) -> tuple[Floats, Floats]:
+        """Depth and normals of `render` alone, at less than half of its time."""
+        layers, tables = _stack(self._static, moving)
+        hits = self._cast(layers, self._pixels, T_world_camera)
+        return self._geometry(tables, hits, T_world_camera)
+
+    def _geometry(
+        self, tables: _Tables, hits: _Hits, T_world_camera: Array
+    ) -> tuple[Floats, Floats]:
+        """Depth (H, W), NaN where nothing is hit, and normals (H, W, 3) toward the camera."""
+        h, w = self._camera.height, self._camera.width
+        t, triangle, rays = hits
+        depth = np.where(triangle >= 0, t, np.nan).astype(np.float32)
+        normals, _ = _facing(tables[0].take(triangle, axis=0, mode="clip")[:, 12:15], rays)
+        normals = normals @ T_world_camera[:3, :3].astype(np.float32)
+        return depth.reshape(h, w), normals.reshape(h, w, 3)
 
     def _supersample(
         self, layers: list[Geometry], tables: _Tables, pixels: Floats, T_world_camera: Array
@@ -118,7 +133,7 @@ class Renderer:
         offsets = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]], np.float32) / np.float32(4)
         many = (pixels[None] + offsets[:, None]).reshape(-1, 2)
         hits = self._cast(layers, many, T_world_camera)
-        colour, _ = self._shade(tables, hits, T_world_camera)
+        colour = self._shade(tables, hits, T_world_camera)
         return colour.reshape(4, -1, 3).mean(0)
 
     def _cast(self, layers: list[Geometry], pixels: Floats, T_world_camera: Array) -> _Hits:
@@ -143,8 +158,8 @@ class Renderer:
             first += len(layer.rows)
         return t, triangle, rays[:, 3:]
 
-    def _shade(self, tables: _Tables, hits: _Hits, T_world_camera: Array) -> tuple[Floats, Floats]:
-        """Colours (N, 3) and world normals (N, 3) toward the camera.
+    def _shade(self, tables: _Tables, hits: _Hits, T_world_camera: Array) -> Floats:
+        """Colours (N, 3), black where nothing is hit.
 
         The footprint of a pixel in the texture is exact: with p = o + t d on the plane of normal
         n, dp/dx = t (D - d (n.D)/(n.d)) for the change D of the ray d from pixel to pixel.
@@ -158,8 +173,7 @@ class Renderer:
         A, n = rows[:, :12].reshape(-1, 3, 4), rows[:, 12:15]
         points = T_world_camera[:3, 3].astype(np.float32) + t[:, None] * d
         value = np.einsum("ncj,nj->nc", A[..., :3], points) + A[..., 3]
-        slope = np.einsum("nj,nj->n", n, d)
-        n = n * -np.sign(slope)[:, None]
+        n, slope = _facing(n, d)
         slope = np.where(np.abs(slope) < 1e-3, np.float32(1e-3), -np.abs(slope))
         R = T_world_camera[:3, :3].astype(np.float32)
         steps = []
@@ -176,17 +190,25 @@ class Renderer:
             colour += sample(self._atlas, texture, uv, level + np.float32(round_up))
         colour *= 0.25 * value[:, 2:]
         colour[triangle < 0] = 0
-        return colour, n
+        return colour
 
 
 _Tables = tuple[Floats, NDArray[np.int32], NDArray[np.int32]]
 _Hits = tuple[Floats, Ints, Floats]
 
 
-def _stack(layers: list[Geometry]) -> _Tables:
-    if len(layers) == 1:
-        return layers[0].rows, layers[0].texture, layers[0].instance
-    return (
+def _facing(normals: Floats, rays: Floats) -> tuple[Floats, Floats]:
+    """Normals (N, 3) turned against the rays (N, 3), and the products (N,) before the turn."""
+    slope = np.einsum("nj,nj->n", normals, rays)
+    return normals * -np.sign(slope)[:, None], slope
+
+
+def _stack(static: Geometry, moving: Geometry | None) -> tuple[list[Geometry], _Tables]:
+    """The layers, and their tables one after another."""
+    if moving is None:
+        return [static], (static.rows, static.texture, static.instance)
+    layers = [static, moving]
+    return layers, (
         np.concatenate([layer.rows for layer in layers]),
         np.concatenate([layer.texture for layer in layers]),
         np.concatenate([layer.instance for layer in layers]),

@@ -16,7 +16,6 @@ from bmask_slam.calibration.views import smooth_value
 from bmask_slam.graph.calibration.model import TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
 from bmask_slam.sequences import open_sequence, read_camera, write_camera
 
 TRUTH = Camera(320, 240, 262.0, 260.0, 158.0, 121.0, depth_scale=5000.0, depth_offset_m=0.015)
@@ -151,16 +150,14 @@ def test_impossible_options_are_refused(made, tmp_path, changes, words) -> None:
 
 
 def test_two_rounds_rerun_with_the_found_camera(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    late_sweep: Path, sweep_camera: Camera, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """On rendered images, with focal lengths 3 % off; only the camera.yaml is left."""
-    sequence, run = tmp_path / "office", tmp_path / "run"
-    config = RenderConfig("office", 36, fps=10.0, width=320, height=240, sweeping=True)
-    render_sequence(config, sequence)
-    truth = read_camera(sequence / "camera.yaml")
+    sequence, run, truth = late_sweep, tmp_path / "run", sweep_camera
     wrong = dataclasses.replace(truth, fx=truth.fx * 1.03, fy=truth.fy * 1.03)
     write_camera(tmp_path / "wrong.yaml", wrong)
     options = ["--camera", str(tmp_path / "wrong.yaml"), "--segmenter", "none", "--quiet"]
+    options += ["--calibrate", "off", "--max-frames", "50"]
     assert cli.main(["run", str(sequence), *options, "--out", str(run)]) == 0
     before = sorted(path.name for path in run.iterdir())
     assert cli.main(["calibrate", str(run), "--reference", str(sequence), "--rounds", "0"]) == 1

@@ -59,12 +59,12 @@ def test_a_live_dense_map_equals_the_offline_one_and_can_be_continued(
     slow_office, tmp_path, capsys
 ) -> None:
     """After a dropped frame, keyframe numbers differ from image numbers."""
-    out, offline = tmp_path / "live", tmp_path / "offline"
-    live = start(slow_office, out, "--realtime", "--map", *UNCALIBRATED, *SHORT)
+    out, offline, some = tmp_path / "live", tmp_path / "offline", ("--max-frames", "16")
+    live = start(slow_office, out, "--realtime", "--map", *UNCALIBRATED, *some)
     output, errors = live.communicate(timeout=300)
     assert live.returncode == 0, errors
     assert "Dense map" in output
-    common = [str(slow_office), "--segmenter", "none", "--out", str(offline), "--quiet", *SHORT]
+    common = [str(slow_office), "--segmenter", "none", "--out", str(offline), "--quiet", *some]
     assert main(["run", *common]) == 0
     assert main(["map", str(offline), "--quiet"]) == 0
     clouds = [read_ply(path / "dense" / "cloud.ply") for path in (out, offline)]
