@@ -264,11 +264,8 @@ def _draw(job: _Job, i: int) -> list[VisibleInstance]:
     true_m, normals = view.depth_m, view.normals
     if job.config.depth_delay_ms:
         delayed_s = time_s + job.config.depth_delay_ms / 1e3
-        moving = _moving(job, delayed_s)
-        true_m, normals = job.renderer.render_depth(job.depth_poses[i], moving)
-    depth_m = true_m
-    if job.config.noise:
-        depth_m = measure_depth(true_m, normals, job.camera, rng)
+        true_m, normals = job.renderer.render_depth(job.depth_poses[i], _moving(job, delayed_s))
+    depth_m = measure_depth(true_m, normals, job.camera, rng) if job.config.noise else true_m
     name = f"{job.stamps[i]}.png"
     write_png(job.folder / "rgb" / name, rgb)
     write_png(job.folder / "depth" / name, stored_depth(depth_m, job.camera.depth_scale))
