@@ -92,7 +92,7 @@ def depth_frame(
     clear = (_least_around(pixels[:, Z], z.shape, PAINT_PX) > 0) & (paint[:, :3] < GLARE).all(1)
     best = (cosine / z.square()).reshape(-1).nan_to_num_().clamp_(*SIGHT)
     paint[:, 3] = best * torch.where(clear, 1, FAINT)
-    free_m = _least_around(pixels[:, Z], z.shape, SILHOUETTE_PX)
+    free_m = _least_around(z.nan_to_num(), z.shape, SILHOUETTE_PX)
     return DepthFrame(pixels, free_m, paint, T_world_camera)
 
 

@@ -88,12 +88,18 @@ class FollowingSurface:
         """Integrate a frame that is not in it yet. Raises InputError: the disk is full."""
         self._parts[number] = _Part.of(frame.T_world_camera, self.volume.integrate(frame))
 
-    def follow(self, poses: Mapping[int, Array], removed: Collection[int] = ()) -> int:
+    def follow(
+        self,
+        poses: Mapping[int, Array],
+        removed: Collection[int] = (),
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> int:
         """Bring frames to their poses T_world_camera (4, 4) of now, and take some out.
 
         Frames that moved by more than a voxel, and those removed, leave the blocks that they
         changed, which are cleared; whatever else had changed these is integrated into them again,
-        all frames in the order in which they came. Returns how many were read again.
+        all frames in the order in which they came. Returns how many were read again; ``progress``
+        is told how many of all were looked at.
 
         Raises:
             InputError: a frame cannot be read, or the disk is full.
@@ -103,14 +109,12 @@ class FollowingSurface:
         moved = {n: T for n, T in known.items() if self._has_moved(n, T)}
         if not moved and not gone:
             return 0
-        stale = torch.zeros(len(self.volume), dtype=torch.bool)
-        for number in (*moved, *gone):
-            self._parts[number].mark(stale)
-        self.volume.clear(stale)
+        stale = self._cleared((*moved, *gone))
         for number in gone:
             del self._parts[number]
         read = 0
-        for number, part in list(self._parts.items()):
+        for done, (number, part) in enumerate(list(self._parts.items())):
+            progress(done)
             if number not in moved and not part.on(stale):
                 continue
             frame = self._load(number, moved.get(number, part.T_world_camera))
@@ -124,6 +128,14 @@ class FollowingSurface:
                 self.volume.integrate(frame, stale)
             read += 1
         return read
+
+    def _cleared(self, numbers: Collection[int]) -> Tensor:
+        """Clear the blocks that some frames changed; returns which they are (B,)."""
+        stale = torch.zeros(len(self.volume), dtype=torch.bool)
+        for number in numbers:
+            self._parts[number].mark(stale)
+        self.volume.clear(stale)
+        return stale
 
     def _has_moved(self, number: int, T_world_camera: Array) -> bool:
         was = self._parts[number].T_world_camera

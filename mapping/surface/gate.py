@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -9,15 +11,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bmask_slam.graph.arrays import Array, Floats, Mask
+from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import inverse
+from bmask_slam.graph.geometry import inverse, transform
 
 CELL_PX, CUBE_M, NEAREST_M = 8, 0.5, 0.1
 IN_FRONT_M, IN_FRONT_SHARE = 0.05, 0.01
 """A pixel nearer than the keyframes' surface by this and this share of its depth is something that
 was not there, or not allowed, in the keyframes."""
-MARGIN_PX = 8
+MARGIN_PX = 16
+
+
+NEAR_VIEWS, MIN_VOTES, POINT_STEP_PX, SEEN_PX = 4, 2, 2, 3
+
+DepthView = tuple[Floats, Array]
+"""Depth (H, W) in metres, NaN where missing, and its T_world_camera (4, 4)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +34,17 @@ class Judgement:
 
     in_front: Mask
     unexplained: Mask
+
+
+class _Unconfirmed:
+    """Points (N, 3) that a view measured, and how many others see them, less those that do not."""
+
+    def __init__(self, view: DepthView, points_world: Array) -> None:
+        self.view, self.points_world = view, points_world
+        self.votes: Ints = np.zeros(len(points_world), np.int64)
+
+    def confirmed(self) -> Floats:
+        return self.points_world[self.votes >= MIN_VOTES].astype(np.float32)
 
 
 class KeyframeSurface:
@@ -42,16 +61,47 @@ class KeyframeSurface:
 
     def judge(self, depth_m: Floats, T_world_camera: Array) -> Judgement:
         """Compare a frame's depth (H, W) with the surface as it looks from there."""
-        nearest = self.nearest(T_world_camera)
-        around = cv2.erode(np.pad(nearest, 1, "edge"), np.ones((3, 3), np.uint8))[1:-1, 1:-1]
-        nearest = np.where(np.isfinite(nearest), nearest, around)
-        full = np.kron(nearest, np.ones((CELL_PX, CELL_PX), np.float32))
-        full = full[: self._camera.height, : self._camera.width]
-        known = np.isfinite(full)
-        in_front = known & (depth_m * (1 + IN_FRONT_SHARE) + IN_FRONT_M < full)
+        in_front, known = self._compare(depth_m, T_world_camera)
         edge = 2 * MARGIN_PX + 1
         grown = cv2.dilate(in_front.astype(np.uint8), np.ones((edge, edge), np.uint8))
         return Judgement(grown > 0, ~known)
+
+    def _compare(self, depth_m: Floats, T_world_camera: Array) -> tuple[Mask, Mask]:
+        """Pixels (H, W) in front of the surface, and those where it is known.
+
+        Its nearest point on a cell of pixels and the cells around it counts: at the rim of a thing
+        a cell may have points of what is behind alone.
+        """
+        nearest = np.pad(self.nearest(T_world_camera), 1, "edge")
+        nearest = cv2.erode(nearest, np.ones((3, 3), np.uint8))[1:-1, 1:-1]
+        full = np.kron(nearest, np.ones((CELL_PX, CELL_PX), np.float32))
+        full = full[: self._camera.height, : self._camera.width]
+        known = np.isfinite(full)
+        return known & (_farther(depth_m) < full), known
+
+    def seen_again(self, views: Iterable[DepthView]) -> Floats:
+        """Points (N, 3) in front of the surface on which keyframes agree, such as legs of chairs.
+
+        A keyframe may know too little of a thing for a surface. Of the ``NEAR_VIEWS`` before
+        and after it in ``views``, MIN_VOTES more must see a point than see through it.
+        """
+        found, near = [np.zeros((0, 3), np.float32)], deque[_Unconfirmed]()
+        for view in views:
+            new = _Unconfirmed(view, self._in_front(*view))
+            for other in near:
+                other.votes += _votes(other.points_world, view, self._camera)
+                new.votes += _votes(new.points_world, other.view, self._camera)
+            near.append(new)
+            if len(near) > NEAR_VIEWS:
+                found.append(near.popleft().confirmed())
+        return np.concatenate(found + [rest.confirmed() for rest in near])
+
+    def _in_front(self, depth_m: Floats, T_world_camera: Array) -> Array:
+        """Points (N, 3) in the world of every second pixel in front of the surface."""
+        in_front, step = self._compare(depth_m, T_world_camera)[0], POINT_STEP_PX
+        v, u = (step * a for a in np.nonzero(in_front[::step, ::step]))
+        pixels, z = np.stack([u, v], axis=-1).astype(float), depth_m[v, u].astype(float)
+        return transform(T_world_camera, self._camera.backproject(pixels, z))
 
     def nearest(self, T_world_camera: Array) -> Floats:
         """Depth of the nearest point on each cell of pixels, infinite where there is none."""
@@ -79,3 +129,32 @@ class KeyframeSurface:
         seen &= (v > -margin) & (v < camera.height + margin)
         parts = [self._cubes[k] for k in np.flatnonzero(seen).tolist()]
         return torch.cat(parts) if parts else torch.zeros((0, 3))
+
+
+def judge_of(points_world: Floats, views: Iterable[DepthView], camera: Camera) -> KeyframeSurface:
+    """The surface of points (N, 3), and of what else the keyframes agree on, oldest first."""
+    alone = KeyframeSurface(points_world, camera)
+    return KeyframeSurface(np.concatenate([points_world, alone.seen_again(views)]), camera)
+
+
+def _farther(depth_m: Floats) -> Floats:
+    """Depth of what is certainly behind something."""
+    return np.asarray(depth_m * (1 + IN_FRONT_SHARE) + IN_FRONT_M, np.float32)
+
+
+def _votes(points_world: Array, view: DepthView, camera: Camera) -> Ints:
+    """1 where a view sees points (N, 3), -1 where it sees through them, 0 where neither."""
+    depth_m, T_world_camera = view
+    points_camera = transform(inverse(T_world_camera), points_world)
+    rows = np.flatnonzero(points_camera[:, 2] > NEAREST_M)
+    pixels = np.rint(camera.project(points_camera[rows])).astype(np.int64)
+    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    rows, (u, v) = rows[inside], pixels[inside].T
+    z, around = points_camera[rows, 2].astype(np.float32), np.ones((SEEN_PX, SEEN_PX), np.uint8)
+    nearest, least = (
+        cv2.erode(np.nan_to_num(depth_m, nan=missing), around)[v, u] for missing in (np.inf, 0)
+    )
+    votes = np.zeros(len(points_world), np.int64)
+    votes[rows] = (nearest > 2 * z - _farther(z)) & (nearest < _farther(z))
+    votes[rows[least > _farther(z)]] = -1
+    return votes

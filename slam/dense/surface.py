@@ -23,6 +23,7 @@ from bmask_slam.graph.trajectory import nearest_indices, read_tum
 from bmask_slam.graph.whole_file import remove
 from bmask_slam.mapping.inverse_depth.depth_map import from_sensor
 from bmask_slam.mapping.inverse_depth.regularisation import regularise
+from bmask_slam.mapping.products.surface_labels import dilate
 from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame, mark_unexplained
 from bmask_slam.mapping.surface.extraction import (
     MIN_WITNESSES,
@@ -31,7 +32,7 @@ from bmask_slam.mapping.surface.extraction import (
     without_crumbs,
 )
 from bmask_slam.mapping.surface.following import FollowingSurface, read_kept
-from bmask_slam.mapping.surface.gate import KeyframeSurface
+from bmask_slam.mapping.surface.gate import DepthView, KeyframeSurface, judge_of
 from bmask_slam.mapping.surface.volume import SurfaceVolume
 from bmask_slam.run_folder.frame_file import FRAMES, read_frames
 from bmask_slam.semantics.labels import LabelSet
@@ -45,6 +46,8 @@ Progress = Callable[[int, int], None]
 
 VOLUME, INDEX = "volume", "index"
 """The folder of a volume that is kept, and its file of what is in it."""
+BESIDE_PX = 20
+"""Depth so near to a mask that was cut out may be of the same person."""
 AHEAD = 3
 """Frames that are prepared while another is integrated."""
 
@@ -114,9 +117,10 @@ class _SurfaceMaker:
         for number in self._keyframes:
             alone.add(number, self._keyframe(number, poses[number]))
         if frames:
-            seen = extract(alone.volume, 1).vertices
-            self._gate = KeyframeSurface(seen, self._fused.run.camera)
-        read = surface.follow(poses, [n for n in surface if n not in poses])
+            seen = without_crumbs(extract(alone.volume, 1), voxel_m)
+            self._gate = judge_of(seen.vertices, self._views(), self._fused.run.camera)
+        gone = [n for n in surface if n not in poses]
+        read = surface.follow(poses, gone, lambda done: progress(done, len(poses)))
         if read:
             logger.info("%d frames and keyframes were integrated again", read)
         new = {n: T for n, T in frames.items() if n not in surface}
@@ -130,6 +134,17 @@ class _SurfaceMaker:
         if self._kept:
             surface.save(self._folder / INDEX, self._made_of())
         return without_crumbs(found, voxel_m)
+
+    def _views(self) -> Iterator[DepthView]:
+        """The fused depth of the keyframes, oldest first, without what is beside cut-out masks."""
+        folder = self._fused.folder
+        numbers = [self._fused.labels.number(n) for n in self._fused.options.excluded or ()]
+        for keyframe in self._keyframes.values():
+            evidence = folder.evidence(keyframe.id)
+            of_excluded = np.isin(evidence.log_likelihoods.argmax(axis=1), numbers)
+            cut_out = np.isin(evidence.pixels, np.flatnonzero(of_excluded))
+            depth = folder.fused(keyframe.id).without(dilate(cut_out, BESIDE_PX))
+            yield depth.depth_m(), keyframe.T_world_camera
 
     def _volume(self, folder: Path | None = None, kept: Ints | None = None) -> SurfaceVolume:
         folder = self._fused.folder.path if folder is None else folder

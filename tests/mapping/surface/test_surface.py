@@ -17,7 +17,7 @@ from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.mesh_files import write_glb, write_mesh
 from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame, mark_unexplained
 from bmask_slam.mapping.surface.extraction import Surface, extract, without_crumbs
-from bmask_slam.mapping.surface.gate import KeyframeSurface
+from bmask_slam.mapping.surface.gate import KeyframeSurface, judge_of
 from bmask_slam.mapping.surface.volume import SurfaceVolume
 
 NORMAL, OFFSET_M, VOXEL_M, SIGMA = np.array([0.2, -0.1, 1.0]), 2.0, 0.05, 0.002
@@ -114,6 +114,26 @@ def test_the_gate_drops_what_is_in_front_of_the_keyframes_surface() -> None:
     assert not same.unexplained.any()
     away = make_pose(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
     assert keyframes.judge(np.full((30, 40), 2, np.float32), away).unexplained.all()
+
+
+def with_pole(T: Array) -> Array:
+    """Two pixels wide, at 1.5 m."""
+    ((x, _, z),) = transform(inverse(T), np.array([[0.05, 0.0, 1.5]]))
+    rho, column = plane_rho(T, NORMAL, OFFSET_M), round(CAMERA.fx * x / z + CAMERA.cx)
+    rho[:, column : column + 2] = 1 / z
+    return rho
+
+
+def test_the_gate_keeps_thin_things_on_which_keyframes_agree() -> None:
+    """A pole is all rims: the surface has nothing of it."""
+    vertices = surface_of([frame(with_pole(T), T) for T in POSES], 1).vertices
+    assert vertices[:, 2].min() > 1.6
+    poles = [((1 / with_pole(T)).astype(np.float32), T) for T in POSES]
+    planes = [((1 / plane_rho(T, NORMAL, OFFSET_M)).astype(np.float32), T) for T in POSES]
+    assert KeyframeSurface(vertices, CAMERA).judge(*poles[2]).in_front.any()
+    assert not judge_of(vertices, poles, CAMERA).judge(*poles[2]).in_front.any()
+    passing = [*planes[:2], poles[2], *planes[3:]]
+    assert judge_of(vertices, passing, CAMERA).judge(*poles[2]).in_front.any()
 
 
 def test_what_keyframes_did_not_see_needs_more_witnesses() -> None:

@@ -6,7 +6,9 @@ import errno
 import json
 import logging
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,6 +28,7 @@ from bmask_slam.graph.files.array_file import nested, write_arrays
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.trajectory import Trajectory, write_tum
+from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.rendering.sequence import RenderConfig
 from bmask_slam.run_folder.map_file import read_map, write_map
 from bmask_slam.semantics.beliefs.label_store import LabelStore
@@ -176,6 +179,26 @@ def test_excluded_classes_are_missing_or_in_another_cloud(mapped: Path, tmp_path
     assert (still["label"] == chair).mean() < 0.001
     assert (moving["label"] == chair).mean() > 0.9
     assert len(moving["x"]) > 100
+
+
+def test_a_map_of_excluded_classes_alone_is_refused(
+    mapped: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import bmask_slam.dense.products as module
+
+    opened = open_run(mapped)
+    labels = CocoSegmenter(truth_file(opened)).labels
+    options = MapOptions(mapped, voxel_m=0.05, excluded=("chair",))
+    fused = FusedMap(opened, labels, DenseFolder.open(mapped), options)
+    labelled = module._labelled
+
+    def chairs(*given: Any) -> Cloud:
+        cloud = labelled(*given)
+        return replace(cloud, labels=np.full_like(cloud.labels, labels.number("chair")))
+
+    monkeypatch.setattr(module, "_labelled", chairs)
+    with pytest.raises(InputError, match="no surface: all of it is of excluded classes"):
+        module.write_products(fused)
 
 
 def test_keyframes_that_cannot_be_used_are_skipped(
