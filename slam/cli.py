@@ -21,7 +21,7 @@ from bmask_slam.commands.calibrate import add_calibrate
 from bmask_slam.commands.compare import add_compare
 from bmask_slam.commands.evaluate import add_evaluate
 from bmask_slam.commands.live import add_live
-from bmask_slam.commands.map import add_map
+from bmask_slam.commands.map import add_map, add_merge
 from bmask_slam.commands.optimise import add_optimise
 from bmask_slam.commands.results import add_export, add_query
 from bmask_slam.commands.run import add_run
@@ -191,6 +191,7 @@ def make_parser() -> argparse.ArgumentParser:
     add_export(commands)
     add_calibrate(commands)
     add_map(commands)
+    add_merge(commands)
     add_query(commands)
     add_view(commands)
     add_segment(commands)

@@ -15,6 +15,7 @@ from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.tracking.pose_optimisation import CHI2_2DOF, CHI2_3DOF, residuals
 from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.landmark_table import Patches
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
@@ -68,6 +69,26 @@ def fuse_into_surroundings(
     _, observed = world.observed(keyframe)
     known = np.setdiff1d(local_landmarks(world, observed, config.local_map), observed)
     return fuse_into(world, [keyframe], known, tracker, config.fuse_radius_px)
+
+
+def restore_observations(
+    world: WorldMap,
+    keyframe: Keyframe,
+    keypoints: Ints,
+    patches: Patches,
+    tracker: Tracker,
+    config: MappingConfig,
+) -> Ints:
+    """Unmask keypoints (N,) of a keyframe; they observe landmarks there are, or new ones.
+
+    Either get the patches (N) unless they have some. Returns the ids that were fused.
+    """
+    world.unmask(keyframe, keypoints)
+    fused = fuse_into_surroundings(world, keyframe, tracker, config)
+    create_landmarks(world, keyframe, tracker.camera)
+    ids = keyframe.landmark_ids[keypoints]
+    world.landmarks.give_patches(ids[ids >= 0], patches[ids >= 0])
+    return fused
 
 
 def fuse_into(

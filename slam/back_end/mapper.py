@@ -16,10 +16,10 @@ from bmask_slam.back_end.landmark_management import (
     create_landmarks,
     cull_landmarks,
     fuse_into_neighbours,
-    fuse_into_surroundings,
     fuse_loops,
     redundant_keyframe,
     remove_redundant,
+    restore_observations,
 )
 from bmask_slam.back_end.map_backend import add_keyframe, without_image
 from bmask_slam.back_end.pruning import MapPruner
@@ -149,8 +149,10 @@ class Mapper:
     def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
         """Close a keyframe's loops that are confirmed; those that do not fit wait for more."""
         confirmed = self.loops.loops_of(keyframe, self.world)
-        if not confirmed:
-            return []
+        return self.close(confirmed) if confirmed else []
+
+    def close(self, confirmed: list[LoopConstraint]) -> list[LoopConstraint]:
+        """Close loops that confirm each other; returns those that fit the graph."""
         self._change_graph(relative_poses=self.loops.relative_poses(confirmed))
         believed = self.loops.is_strong(confirmed)
         self.loops.closed |= {loop.ends: believed for loop in confirmed}
@@ -174,6 +176,11 @@ class Mapper:
         inliers = len(recognised.landmark_ids)
         self.events.joined(segment, self.world.segment_of(recognised.landmark_ids), inliers)
         joined = join_segment(self.world, segment, tracked, recognised)
+        self.rebuild()
+        return joined
+
+    def rebuild(self) -> None:
+        """Build the graph anew from the map, after segments were moved."""
         loops = self.smoother.relative_poses("loop") + anchors(self.world, self._graph_config)
         old = self.smoother.tables
         self.smoother = Smoother(self.camera, self._graph_config)
@@ -183,7 +190,6 @@ class Mapper:
         update = self.sensors.carry_over(old, self.smoother.tables, self.world).added_to(update)
         self._apply(self.smoother.update(update))
         self.add_waiting_measurements()
-        return joined
 
     def pruner(self) -> MapPruner:
         """The pruner of this map and graph."""
@@ -207,16 +213,11 @@ class Mapper:
         They observe landmarks that the map has by now, or new ones. Either get the image patches
         (N) of what the keypoints observed before, unless they have patches already.
         """
-        world = self.world
-        keyframe = world.keyframes.get(keyframe_id)
-        if keyframe is None or not len(keypoints):
-            return
-        world.unmask(keyframe, keypoints)
-        fused = fuse_into_surroundings(world, keyframe, self._tracker, self._mapping)
-        self._factor_selector.remove_landmarks(fused)
-        create_landmarks(world, keyframe, self.camera)
-        ids = keyframe.landmark_ids[keypoints]
-        world.landmarks.give_patches(ids[ids >= 0], patches[ids >= 0])
+        keyframe = self.world.keyframes.get(keyframe_id)
+        if keyframe is not None and len(keypoints):
+            given = keypoints, patches, self._tracker, self._mapping
+            fused = restore_observations(self.world, keyframe, *given)
+            self._factor_selector.remove_landmarks(fused)
 
     def finish(self) -> None:
         """Full bundle adjustment, again without outliers; the map is then final."""

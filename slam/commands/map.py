@@ -1,4 +1,4 @@
-"""``bmask-slam map``: a dense, semantic map of a finished run."""
+"""``bmask-slam map`` and ``merge``: a dense map of a finished run; several runs as one."""
 
 from __future__ import annotations
 
@@ -17,6 +17,13 @@ Every keyframe's depth is fused with its neighbours'; keyframes that are finishe
 again. Then all tracked frames make one surface. Points get labels if the run had a segmenter, or
 with --segmenter or --masks; what became of a label in the run's map shows here when called
 again."""
+
+MERGE = "make one run of several finished runs that have places in common"
+MERGE_MORE = """\
+Places that two runs have in common are found by their landmarks' looks and verified by their
+geometry; keyframes, landmarks, labels and objects are joined, and everything is optimised once, in
+the world frame of the first run. Refused, with how near it came: a run that has no place in common
+with the others, or one that only looks alike. The result is a run folder like any other."""
 
 
 def add_map(commands: Commands) -> None:
@@ -89,3 +96,27 @@ def _masks(arguments: argparse.Namespace) -> SegmenterOptions | None:
             return None
         arguments.segmenter = "light" if arguments.masks is None else "precomputed"
     return segmenter_options(arguments, SegmenterOptions())
+
+
+def add_merge(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser("merge", help=MERGE, description=f"{MERGE}. {MERGE_MORE}")
+    parser.set_defaults(handler=_merge)
+    text = "folders of finished runs, two or more"
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help=text)
+    parser.add_argument("--out", type=Path, required=True, metavar="F", help="run folder to make")
+    text = "replace the run that --out holds; never an input"
+    parser.add_argument("--overwrite", action="store_true", help=text)
+    parser.add_argument("--quiet", action="store_true", help="print only the folder's path")
+
+
+def _merge(arguments: argparse.Namespace) -> int:
+    from bmask_slam.merging.merge import MergeOptions, merge_runs
+    from bmask_slam.merging.report import format_merge
+    from bmask_slam.runtime.progress import console_log
+
+    options = MergeOptions(tuple(arguments.runs), arguments.out, arguments.overwrite)
+    with console_log():
+        summary = merge_runs(options)
+    print(summary.folder if arguments.quiet else format_merge(summary))
+    return 0

@@ -131,8 +131,10 @@ class LoopCloser:
             return []
         return self.confirm(self.propose(keyframe, world), world)
 
-    def propose(self, keyframe: Keyframe, world: WorldMap) -> list[LoopConstraint]:
-        """Verified loops between a keyframe and older ones."""
+    def propose(
+        self, keyframe: Keyframe, world: WorldMap, elsewhere: bool = False
+    ) -> list[LoopConstraint]:
+        """Verified loops between a keyframe and older ones; ``elsewhere``: of other segments."""
 
         def covisible(keyframe_id: int) -> list[int]:
             _, ids = world.observed(world.keyframes[keyframe_id])
@@ -149,7 +151,8 @@ class LoopCloser:
             others = [k for k in covisible(candidate.keyframe_id) if k not in tried]
             others = others[: self.config.neighbours]
             for other in (candidate.keyframe_id, *others):
-                if other in tried or world.keyframes[other].segment != keyframe.segment:
+                here = world.keyframes[other].segment == keyframe.segment
+                if other in tried or here is elsewhere:
                     break
                 tried.add(other)
                 old = loop_view(world.keyframes[other], world)
@@ -169,9 +172,8 @@ class LoopCloser:
         if not loops:
             return []
         found, loops = loops, [*self.waiting, *loops][-self.config.waiting :]
-        chosen = _largest_clique(self._agreement(loops, world))
-        supported = len(chosen) >= self.config.min_support
-        confirmed = [loops[k] for k in chosen] if supported else []
+        agreeing = self.agreeing(loops, world)
+        confirmed = agreeing if len(agreeing) >= self.config.min_support else []
         if len({loop.keyframe_b for loop in confirmed}) < 2:
             confirmed = []
         self.noise.learn(confirmed, world)
@@ -181,6 +183,18 @@ class LoopCloser:
             if loop.ends not in entering:
                 self._events.loop_found(loop.ends, loop.inliers)
         return confirmed
+
+    def agreeing(self, loops: list[LoopConstraint], world: WorldMap) -> list[LoopConstraint]:
+        """The largest set of loops that agree with each other over the map's paths."""
+        return [loops[k] for k in _largest_clique(self._agreement(loops, world))]
+
+    def contradicts(
+        self, loop: LoopConstraint, others: list[LoopConstraint], world: WorldMap
+    ) -> bool:
+        """Whether a loop disagrees with most others by more than the map can have drifted."""
+        cycles = Cycles.of([loop, *others], world)
+        chi2 = cycles.chi2(self.noise.ratio, self.noise.map_covariances(cycles.paths))
+        return bool(np.median(chi2[cycles.first == 0]) > self.config.gate)
 
     def is_strong(self, loops: list[LoopConstraint]) -> bool:
         """Whether a confirmed set is trusted more than the graph."""

@@ -21,6 +21,8 @@ trajectory.png        top view with marks of events, and errors against the refe
 log.txt               the log
 camera.yaml           the camera of the run, where readout time or delay were found and adopted;
                       or what ``bmask-slam calibrate`` found
+recordings.json       of a merged run: its recordings, and what was added to their stamps
+trajectory_run_N.txt  of a merged run: the frames of the Nth run, with its own stamps
 health.json           of a live run: rates, delays, queues, what was dropped, every second
 checkpoint            while a run with ``--checkpoint-every`` is not finished: the state from
                       which ``run --resume`` goes on; removed when the run is complete
@@ -51,6 +53,7 @@ from bmask_slam.run_folder.frame_file import COLUMNS, FRAMES, frame_row
 from bmask_slam.run_folder.open_files import LOG, OpenFiles
 from bmask_slam.run_folder.semantic_files import SEMANTIC_FILES
 from bmask_slam.runtime.memory import is_out_of_memory
+from bmask_slam.sequences.formats.joined import JOINED
 from bmask_slam.tracking.results import FrameResult
 
 FILES = (
@@ -72,7 +75,7 @@ SEQUENCE_FILES = ("rgb.txt", "depth.txt", "associations.txt")
 """What is only in a folder that nothing may be removed from."""
 DENSE = "dense"
 HEALTH = "health.json"
-SOMETIMES = (CHECKPOINT, CAMERA, COVARIANCES, HEALTH, *SEMANTIC_FILES)
+SOMETIMES = (CHECKPOINT, CAMERA, COVARIANCES, HEALTH, JOINED, *SEMANTIC_FILES)
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("bmask_slam",)
 GROWING = {FRAMES: COLUMNS, EVENTS: EVENT_COLUMNS}
@@ -195,6 +198,10 @@ class RunFolder:
     def empty_bytes(self) -> dict[str, int]:
         """Sizes in bytes by name of the files that grow, with nothing in them but the header."""
         return {name: len(",".join(columns).encode()) + 1 for name, columns in GROWING.items()}
+
+    def write_rows(self, name: str, rows: Iterable[dict[str, object]]) -> None:
+        """Append lines to frames.csv or events.csv, which come from another run."""
+        self._tables[name].append(rows)
 
     def begin_anew(self) -> None:
         """Take back all frames and events: the run begins with its first frame again."""

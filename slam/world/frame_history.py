@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.files.array_file import split_rows
 from bmask_slam.graph.geometry import inverse
-from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.graph.trajectory import Trajectory, nearest_indices
 from bmask_slam.graph.trajectory_smoothing import smooth
 from bmask_slam.world.world_map import WorldMap
 
@@ -91,6 +91,14 @@ class FrameHistory:
         for _, rows, origins, measured in self._segments(world):
             found = smooth(measured, self._store["information"][rows])
             self._store["T_keyframe_camera"][rows] = inverse(origins) @ found.poses_world_camera
+
+    def place(self, world: WorldMap, path: Trajectory) -> None:
+        """Give the frames that have these stamps these poses T_world_camera."""
+        for _, rows, origins, measured in self._segments(world):
+            at = nearest_indices(path.timestamps_s, measured.timestamps_s)
+            same = np.flatnonzero(path.timestamps_s[at] == measured.timestamps_s)
+            found = path.poses_world_camera[at[same]]
+            self._store["T_keyframe_camera"][rows[same]] = inverse(origins[same]) @ found
 
     def _segments(self, world: WorldMap) -> Iterator[tuple[int, Ints, Array, Trajectory]]:
         """Each map segment: its number, rows (N,) of its entries, what these are relative to,

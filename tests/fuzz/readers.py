@@ -667,6 +667,8 @@ def document_readers(folder: Path) -> list[Reader]:
     record = b'{"status": "done", "error": "", "wall_s": 1.5, "figures": {"a": 1.0}, "depends": {}}'
     settings = b'{"method": 3, "labels": ["background"], "voxel_m": 0.01, "without": []}'
     results = written(folder, lambda p: write_results(p, make_comparison(folder)))
+    part = {"sequence": str(make_sequence(folder / "part", 3)), "begin_s": 0.0, "end_s": 0.2}
+    joined = json.dumps({"recordings": [part | {"shift_s": s} for s in (0.0, 11.0)]}).encode()
 
     def of_json(name: str, file: str, read: Callable[[Path], Any], seed: bytes) -> Reader:
         return Reader(name, file, read, (seed,), json_maker(seed))
@@ -684,6 +686,7 @@ def document_readers(folder: Path) -> list[Reader]:
         of_json("objects.json", "objects.json", in_folder(read_objects), objects()),
         of_json("metrics.json", "metrics.json", in_folder(lambda p: Run(p).metrics), metrics),
         of_json("results.json", "results.json", read_results, results),
+        of_json("recordings.json", "recordings.json", read_first, joined),
         of_json("record of a job", "cell.json", read_record, record),
         of_json("dense/settings.json", "s.json", read_dense_settings, settings),
     ]  # fmt: skip

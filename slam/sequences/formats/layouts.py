@@ -15,6 +15,7 @@ from bmask_slam.sequences.bags.bag_recording import open_bag_recording
 from bmask_slam.sequences.bags.topics import split_path
 from bmask_slam.sequences.cameras import find_camera
 from bmask_slam.sequences.formats.euroc import is_euroc, open_euroc
+from bmask_slam.sequences.formats.joined import is_joined, open_joined
 from bmask_slam.sequences.formats.numbered_folders import (
     is_icl_nuim,
     is_open3d,
@@ -53,7 +54,11 @@ FOLDERS = (
 )
 """Folders other than TUM's, in the order in which they are tried. TUM's lists win over all but
 ICL-NUIM."""
-FILES = (Layout(is_sens, open_sens), Layout(is_r3d, open_r3d))
+FILES = (
+    Layout(is_sens, open_sens),
+    Layout(is_r3d, open_r3d),
+    Layout(is_joined, lambda path, camera: open_joined(path, camera, open_recording)),
+)
 _LISTS = ("rgb.txt", "depth.txt", "associations.txt")
 
 

@@ -5,6 +5,7 @@ from synthetic_view import add_keyframe, make_features
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp
+from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.world_map import WorldMap
 
@@ -126,3 +127,16 @@ def test_a_state_without_information_is_not_smoothed() -> None:
     np.testing.assert_allclose(
         history.trajectories(world)[0].poses_world_camera, before, atol=1e-12
     )
+
+
+def test_frames_can_be_placed_by_their_stamps() -> None:
+    keyframe_poses, frames = random_poses(3), random_poses(6)
+    world, history = world_of(keyframe_poses, (0, 1, 1)), FrameHistory()
+    for i, T in enumerate(frames):
+        history.append(i / 30, i // 2, keyframe_poses[i // 2], T)
+    placed = random_poses(3)
+    history.place(world, Trajectory(np.array([1, 3, 8]) / 30, placed))
+    frames[[1, 3]] = placed[:2]  # no frame has the third stamp
+    for segment, rows in ((0, [0, 1]), (1, [2, 3, 4, 5])):
+        found = history.trajectories(world)[segment].poses_world_camera
+        np.testing.assert_allclose(found, frames[rows], atol=1e-12)

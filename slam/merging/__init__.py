@@ -1,0 +1,1 @@
+"""Maps of several finished runs made one."""

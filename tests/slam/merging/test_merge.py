@@ -1,0 +1,144 @@
+"""Finished runs merged: two walks along one plane, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, render_plane, sideways_path
+
+from bmask_slam import cli
+from bmask_slam.config.configuration import dump
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.merging.merge import MergeOptions, merge_runs
+from bmask_slam.merging.report import MergeSummary
+from bmask_slam.run_folder import metrics
+from bmask_slam.run_folder.folder import RunFolder
+from bmask_slam.run_folder.map_file import read_map, write_map
+from bmask_slam.run_folder.reader import Run
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.keyframe_decision import KeyframeConfig
+
+PLACE = se3_exp(np.array([0.0, 0.0, 0.3, 0.2, 0.1, 0.0]))
+"""The second walk's camera is turned about its axis and begins elsewhere."""
+FIRST_M, SECOND_M = np.linspace(-1.7, -0.6, 12), np.linspace(-1.4, -0.3, 12)
+FAR_M = np.linspace(1.5, 1.7, 3)
+OFTEN = KeyframeConfig(min_interval_frames=1, late_frames=2, late_shared=1.0)
+WALKS = {
+    "first": sideways_path(FIRST_M),
+    "second": [T @ PLACE for T in sideways_path(SECOND_M)],
+    "far": sideways_path(FAR_M),
+}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a run of each walk; the frames of each begin at stamp 0."""
+    folder = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(metrics, "plot_trajectory", lambda path, *_: path.write_text("quick"))
+        for name, poses in WALKS.items():
+            system = SlamSystem(CAMERA, SystemConfig(keyframes=OFTEN))
+            with RunFolder(folder / name) as run:
+                run.write_text("config.yaml", f"# bmask-slam 0, live\n{dump(system.config)}")
+                for index, T in enumerate(poses):
+                    run.write_frame(system.process(render_plane(T, index)))
+                system.finish()
+                metrics.save(system, run, [], None, name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def merged(runs: Path) -> MergeSummary:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(metrics, "plot_trajectory", lambda path, *_: path.write_text("quick"))
+        return merge_runs(MergeOptions((runs / "first", runs / "second"), runs / "merged"))
+
+
+def test_both_walks_are_where_they_were_in_one_world(merged: MergeSummary) -> None:
+    for number, name in enumerate(("first", "second"), 1):
+        found = read_tum(merged.folder / f"trajectory_run_{number}.txt")
+        true = inverse(WALKS["first"][0]) @ np.array(WALKS[name])
+        errors = se3_log(inverse(true) @ found.poses_world_camera)
+        assert np.abs(errors[:, 3:]).max() < 0.01
+        assert np.abs(errors[:, :3]).max() < 0.005
+        assert found.timestamps_s == pytest.approx(np.arange(12) / 30, abs=1e-6)
+
+
+def test_what_both_saw_is_there_once(merged: MergeSummary, runs: Path) -> None:
+    alone = [len(Run(runs / name).landmarks.ids) for name in ("first", "second")]
+    together = len(Run(merged.folder).landmarks.ids)
+    assert max(alone) < together < 0.9 * sum(alone)
+    values = Run(merged.folder).metrics
+    assert values["merge_loops"].value >= 6
+    assert values["merge_loops_wrong"].value == 0
+    assert values["merge_loop_rms_m"].value < 0.01
+
+
+def test_the_result_is_one_run(merged: MergeSummary, runs: Path) -> None:
+    run = Run(merged.folder)
+    first, second = (Run(runs / name) for name in ("first", "second"))
+    assert len(run.frames) == len(run.trajectory) == 24
+    assert (np.diff(run.frames.index) == 1).all()
+    made = run.frames.keyframe_ids[run.frames.keyframe_ids >= 0]
+    assert len(made) == len(np.unique(made)) == len(first.keyframes) + len(second.keyframes)
+    assert (run.keyframes.ids >= 0).all()
+    assert run.is_finished
+    with (merged.folder / "events.csv").open(newline="") as file:
+        assert {"new segment", "loop closed"} <= {row["kind"] for row in csv.DictReader(file)}
+
+
+def test_the_map_is_tracked_in_from_both_walks(merged: MergeSummary) -> None:
+    state, camera = read_map(merged.folder)
+    system = SlamSystem(camera)
+    system.restore(state, merged.folder)
+    system.begin_session()
+    for index, x_m in enumerate((-1.5, -1.47, -1.44)):
+        result = system.process(render_plane(sideways_path(np.array([x_m]))[0], index))
+    assert result.segment == 0
+    expected = inverse(WALKS["first"][0]) @ sideways_path(np.array([-1.44]))[0]
+    assert result.T_world_camera == pytest.approx(expected, abs=0.01)
+
+
+def test_a_run_without_a_common_place_is_named(runs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match=r"far: has no place in common with the other runs"):
+        merge_runs(MergeOptions((runs / "first", runs / "far"), out))
+    assert not out.exists()
+
+
+def test_what_cannot_be_merged_is_refused(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    state, camera = read_map(runs / "second")
+    other = shutil.copytree(runs / "second", tmp_path / "other")
+    write_map(other / "map", state, replace(camera, fx=500.0))
+    unfinished = shutil.copytree(runs / "second", tmp_path / "unfinished")
+    (unfinished / "map").unlink()
+    for given, text in (
+        ([other], "made with another camera (fx 500.0)"),
+        ([unfinished], "holds no map, so it is not a finished run"),
+        ([runs / "first"], "given twice"),
+        ([], "give two runs or more"),
+        ([tmp_path / "nothing"], "no such folder"),
+    ):
+        words = ["merge", *map(str, [runs / "first", *given]), "--out", str(tmp_path / "out")]
+        assert cli.main(words) == 1
+        error = capsys.readouterr().err
+        assert text in error
+        assert error.count("\n") == 1
+    assert cli.main(["merge", str(runs / "first"), str(other), "--out", str(other)]) == 1
+
+
+def test_recordings_are_listed_where_they_are_known(merged: MergeSummary) -> None:
+    assert not (merged.folder / "recordings.json").exists()  # these runs were live
+    assert "live" in (merged.folder / "config.yaml").read_text().splitlines()[0]
+    assert json.loads((merged.folder / "metrics.json").read_text())
