@@ -89,6 +89,8 @@ REPORTS = {
             "live.soak {sequences}/office-300 {sequences}/living_room --minutes 60 "
             "--picture docs/images/live_soak.png",
         ),
+        "peak": ("Peak of 600 frames", ""),
+        "memory": ("Memory of the map", "live.map_memory ../shared/data/redkitchen --frames 600"),
     }, pictures={
         "soak": {"live_soak.png": "Latency, memory, descriptors and keyframes over the hour"},
     }),

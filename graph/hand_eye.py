@@ -7,7 +7,6 @@ an offset, so that rotations of the camera move it differently.
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
@@ -45,6 +44,8 @@ def hand_eye(estimate: Trajectory, reference: Trajectory) -> Array:
             f"{np.rad2deg(most_rad):.2f} degrees: where the reference's body sits cannot be seen; "
             "evaluate without --hand-eye"
         )
+    from scipy.optimize import least_squares  # noqa: PLC0415 - 15 MB that a run does not need
+
     U, _, Vt = np.linalg.svd(turns_a.T @ turns_b)
     no_reflection = np.array([1.0, 1.0, np.linalg.det(U @ Vt)])
     start = make_pose((U * no_reflection) @ Vt, np.zeros(3))

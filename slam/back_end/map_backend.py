@@ -6,13 +6,11 @@ whose map and graph are in a process of their own.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
 from bmask_slam.events import EventLog
-from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.loops.verification import LoopConstraint
@@ -63,8 +61,3 @@ def add_keyframe(world: WorldMap, frame: Frame, tracked: Tracked, segment: int) 
     )
     world.add_keyframe(keyframe)
     return keyframe
-
-
-def without_image(features: Features) -> Features:
-    """The features without their grey image, which a keyframe needs until patches are cut."""
-    return replace(features, gray=np.zeros((0, 0), np.uint8))

@@ -21,7 +21,7 @@ from bmask_slam.back_end.landmark_management import (
     remove_redundant,
     restore_observations,
 )
-from bmask_slam.back_end.map_backend import add_keyframe, without_image
+from bmask_slam.back_end.map_backend import add_keyframe
 from bmask_slam.back_end.pruning import MapPruner
 from bmask_slam.back_end.segment_joining import anchors, join_segment
 from bmask_slam.back_end.triangulation import triangulate_landmarks
@@ -40,8 +40,8 @@ from bmask_slam.sensing.sensor_fusion import SensorFusion
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.results import Tracked
 from bmask_slam.tracking.tracker import Tracker
+from bmask_slam.world.appearance import Patches
 from bmask_slam.world.frame_history import FrameHistory
-from bmask_slam.world.landmark_table import Patches
 from bmask_slam.world.map_state import world_of, world_state
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
@@ -134,10 +134,12 @@ class Mapper:
         fused = fuse_into_neighbours(world, keyframe, new_ids, self._tracker, self._mapping)
         triangulate_landmarks(world, keyframe, self.camera, self._mapping.triangulation)
         world.renew_patches(keyframe, self._tracker.config.subpixel)
-        keyframe.features = without_image(keyframe.features)
+        world.store_features(keyframe)
         self._factor_selector.remove_landmarks(fused)
         self._factor_selector.remove_landmarks(cull_landmarks(world, local_ids, self._mapping))
         self.loops.add(keyframe)
+        world.release_memory()
+        self.history.release_memory()
         return keyframe
 
     def optimise(self, keyframe: Keyframe) -> None:

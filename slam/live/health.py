@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from array import array
 from collections import deque
 from dataclasses import asdict, dataclass, field
 
@@ -99,7 +100,7 @@ class FrameMeter:
     def __init__(self) -> None:
         self.frames = self.refused = self.lost_frames = self.lost_episodes = 0
         self.status = ""
-        self.latencies_ms: list[float] = []
+        self.latencies_ms: array[float] = array("d")
         self._ends_s: deque[float] = deque(maxlen=WINDOW)
 
     def count(self, result: FrameResult, latency_ms: float) -> None:

@@ -14,8 +14,8 @@ from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.live.replica import WorldDelta
 from bmask_slam.semantics.instances.instances import Instance, PackedMask
 from bmask_slam.tracking.results import Tracked
+from bmask_slam.world.appearance import Patches
 from bmask_slam.world.frame_history import Entries
-from bmask_slam.world.landmark_table import Patches
 
 STATE_FILE = FileKind("live state", 6)
 """What the map's process saves: its system's state, and the camera in the header."""

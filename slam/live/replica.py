@@ -7,12 +7,15 @@ of them, but descriptors, patches and observations only where they changed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from hashlib import blake2b
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bmask_slam.features.brisk import Features
-from bmask_slam.graph.arrays import Array, Arrays, Bytes, Ints, Mask
+from bmask_slam.graph.arrays import Array, Arrays, Bits, Bytes, Ints, Mask
 from bmask_slam.graph.geometry import carried_along
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.world_map import Keyframe, WorldMap
@@ -24,6 +27,7 @@ COLUMNS = (
 """Columns of the landmark table that are sent; tracking counts ``visible`` and ``found``."""
 COMPARED = ("descriptors", "directions", "patch_views", "host", "observations")
 """Columns that are compared: the others change only together with one of these."""
+_ODD, _HALF = np.uint64(0x9E3779B97F4A7C15), np.uint64(32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +76,12 @@ class WorldDelta:
 
 @dataclass
 class _Sent:
-    """What the copy has; landmarks are the valid ones, whose ids are ``ids``."""
+    """What the copy has, as digests; landmarks are the valid ones, whose ids are ``ids``."""
 
     ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    landmarks: Arrays = field(default_factory=dict)
+    landmarks: Bits = field(default_factory=lambda: np.zeros(0, np.uint64))
     fused: int = 0
-    observations: dict[int, Ints] = field(default_factory=dict)
-    masked: dict[int, Mask] = field(default_factory=dict)
+    observations: dict[int, bytes] = field(default_factory=dict)
     parents: set[int] = field(default_factory=set)
 
 
@@ -101,7 +104,7 @@ class DeltaMaker:
         replaced_by = table.replaced_by.copy() if fused != self._sent.fused else None
         self._sent.fused = fused
         for culled in self._sent.observations.keys() - world.keyframes.keys():
-            del self._sent.observations[culled], self._sent.masked[culled]
+            del self._sent.observations[culled]
         return WorldDelta(
             size=len(table),
             in_map=np.packbits(table.in_map),
@@ -121,26 +124,18 @@ class DeltaMaker:
         """Valid landmarks whose compared columns differ from what was sent before."""
         table, sent = world.landmarks, self._sent
         ids = np.flatnonzero(table.in_map)
-        columns = {name: getattr(table, name)[ids] for name in COMPARED}
+        digests = digest_rows([getattr(table, name)[ids] for name in COMPARED])
         _, now, sent_rows = np.intersect1d(ids, sent.ids, assume_unique=True, return_indices=True)
-        same = np.ones(len(now), bool)
-        for name in COMPARED if len(now) else ():
-            a, b = columns[name][now], sent.landmarks[name][sent_rows]
-            bytes_a, bytes_b = (rows.reshape(len(now), -1).view(np.uint8) for rows in (a, b))
-            same &= (bytes_a == bytes_b).all(axis=1)  # NaN is equal to itself
-        sent.ids, sent.landmarks = ids, columns
+        same = digests[now] == sent.landmarks[sent_rows]
+        sent.ids, sent.landmarks = ids, digests
         return np.delete(ids, now[same])
 
     def _has_changed(self, keyframe: Keyframe) -> bool:
-        sent = self._sent
-        return not (
-            np.array_equal(sent.observations.get(keyframe.id, ()), keyframe.landmark_ids)
-            and np.array_equal(sent.masked.get(keyframe.id, ()), keyframe.masked)
-        )
+        return self._sent.observations.get(keyframe.id) != _digest(keyframe)
 
     def _row(self, keyframe: Keyframe) -> KeyframeRow:
         ids, masked = keyframe.landmark_ids.copy(), keyframe.masked.copy()
-        self._sent.observations[keyframe.id], self._sent.masked[keyframe.id] = ids, masked
+        self._sent.observations[keyframe.id] = _digest(keyframe)
         features = None if keyframe.id in self._features else keyframe.features
         self._features.add(keyframe.id)
         return KeyframeRow(ids, masked, keyframe.frame_index, keyframe.timestamp_s, features)
@@ -149,6 +144,26 @@ class DeltaMaker:
         fresh = {k: parent for k, parent in history.parents.items() if k not in self._sent.parents}
         self._sent.parents |= fresh.keys()
         return fresh
+
+
+def digest_rows(columns: Sequence[NDArray]) -> Bits:
+    """A number (N,) for each row of columns of 8-byte entries (N, ...): equal for equal bytes.
+
+    Two rows that differ have the same number with a probability of 2^-64.
+    """
+    digests = np.zeros(len(columns[0]), np.uint64)
+    for column in columns:
+        for words in np.ascontiguousarray(column).reshape(len(column), -1).view(np.uint64).T:
+            digests = (digests ^ words) * _ODD
+            digests ^= digests >> _HALF
+    return digests
+
+
+def _digest(keyframe: Keyframe) -> bytes:
+    """16 bytes for what a keyframe observes."""
+    found = blake2b(keyframe.landmark_ids.tobytes(), digest_size=16)
+    found.update(keyframe.masked.tobytes())
+    return found.digest()
 
 
 def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> None:
@@ -201,6 +216,7 @@ def _keyframe(keyframe_id: int, delta: WorldDelta, world: WorldMap) -> Keyframe:
         assert row is not None and row.features is not None, "a delta of another map"
         about = (keyframe_id, row.frame_index, row.timestamp_s, 0, np.eye(4), row.features)
         keyframe = Keyframe(*about, row.landmark_ids)
+        world.store_features(keyframe)
     if row is not None:
         keyframe.landmark_ids, keyframe.masked = row.landmark_ids, row.masked
     return keyframe

@@ -21,6 +21,7 @@ from bmask_slam.offline.options import RunOptions
 from bmask_slam.offline.self_calibration import SelfCalibrator
 from bmask_slam.run_folder.folder import CAMERA, CHECKPOINT, DENSE, RunFolder
 from bmask_slam.run_folder.metrics import RunCounters, measure, save
+from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.runtime.progress import Progress
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.sequences import Sequence, format_camera
@@ -35,9 +36,11 @@ SNAPSHOT_FRAMES = 30
 SNAPSHOT_GROWTH = 1.05
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class ActiveRun:
     """A run that has its system and its folder.
+
+    Where it begins anew, sequence, system and counters are replaced, so that nothing keeps the old.
 
     Attributes:
         options: what to run, and how.
@@ -180,6 +183,7 @@ def finish_run(run: ActiveRun) -> RunSummary:
     """Finish the system, measure and save; a run that was not stopped is complete then."""
     counters, options, stopped_by = run.counters, run.options, run.stop.signal
     run.system.finish()
+    give_back_memory()  # ISAM2's, which is not needed any more
     run.folder.write_events(run.system.events.take())
     rows = measure(run.system, run.reference, counters, options.stride)
     checked = _camera_checked(run)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import platform
 import shlex
@@ -37,6 +38,7 @@ from bmask_slam.run_folder.map_file import read_map
 from bmask_slam.run_folder.metrics import RunCounters
 from bmask_slam.run_folder.open_files import free_run_path
 from bmask_slam.run_folder.origin import Origin
+from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
@@ -76,8 +78,15 @@ def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummar
         calibrator = _calibrator(options, inherited_calibration(options, sequence), masks)
         if calibrator.state.adopted:
             sequence = open_sequence(options.sequence, camera=calibrator.state.camera)
-        system = with_sensors(start_system(options, sequence, make), sequence)
-        active = ActiveRun(options, sequence, reference, system, folder, stop, calibrator)
+        active = ActiveRun(
+            options,
+            sequence,
+            reference,
+            with_sensors(start_system(options, sequence, make), sequence),
+            folder,
+            stop,
+            calibrator,
+        )
         return _finished(active, make)
 
 
@@ -101,8 +110,9 @@ def resume(
     checkpoint.check_sequence(sequence)
     reference = find_reference(options.reference, sequence)
     make, masks = _system_maker(make_system, options, sequence)
-    system, counters = make(sequence.camera, options.config), checkpoint.counters
+    counters, system = checkpoint.counters, make(sequence.camera, options.config)
     system.restore(checkpoint.state, path / CHECKPOINT)
+    checkpoint = replace(checkpoint, state={})  # it is as large as the map
     with RunFolder(path, resume_bytes=checkpoint.sizes) as folder, StopRequest() as stop:
         logger.info("resumed after %d frames: %s", counters.frames, shlex.join(sys.argv))
         if not counters.frames:
@@ -111,6 +121,7 @@ def resume(
             sequence.skip(index, reason)
         calibrator = _calibrator(options, checkpoint.calibration, masks)
         active = ActiveRun(options, sequence, reference, system, folder, stop, calibrator, counters)
+        del system  # the run may begin anew with another
         return _finished(active, make)
 
 
@@ -118,12 +129,11 @@ def _finished(active: ActiveRun, make_system: MakeSystem) -> RunSummary:
     """A run after its last frame, begun anew as often as another camera was found for it."""
     while process_frames(active):
         options, camera = active.options, active.calibrator.state.camera
-        active = replace(
-            active,
-            sequence=open_sequence(options.sequence, camera=camera),
-            system=with_sensors(make_system(camera, options.config), active.sequence),
-            counters=RunCounters(wall_s=active.counters.wall_s),
-        )
+        active.sequence = open_sequence(options.sequence, camera=camera)
+        active.system = with_sensors(make_system(camera, options.config), active.sequence)
+        active.counters = RunCounters(wall_s=active.counters.wall_s)
+        gc.collect()  # the system of before, whose parts know each other
+        give_back_memory()
     return finish_run(active)
 
 

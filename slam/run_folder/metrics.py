@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bmask_slam.evaluation import Row, evaluate_trajectory, format_json
-from bmask_slam.evaluation.plot import plot_trajectory
 from bmask_slam.events import read_events
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
@@ -120,6 +119,8 @@ def save(
     system: System, folder: RunFolder, rows: list[Row], reference: Trajectory | None, title: str
 ) -> None:
     """Write the result files."""
+    from bmask_slam.evaluation.plot import plot_trajectory  # noqa: PLC0415 - matplotlib is large
+
     trajectory = system.trajectory()
     save_poses_and_points(system, folder)
     files = system.files()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.files.array_file import split_rows
+from bmask_slam.graph.files.disk_arrays import DiskRows
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices
 from bmask_slam.graph.trajectory_smoothing import smooth
@@ -37,7 +38,7 @@ class FrameHistory:
     """One entry for each tracked frame; the frames of a culled keyframe go to its parent."""
 
     def __init__(self) -> None:
-        self._store: Entries = np.zeros(1024, ENTRY)
+        self._entries = DiskRows(1024, (), ENTRY)
         self._size = 0
         self._parent: dict[int, tuple[int, Array]] = {}
 
@@ -65,12 +66,10 @@ class FrameHistory:
 
     def extend(self, entries: Entries) -> None:
         """Append entries of another history."""
-        size = self._size + len(entries)
-        if size > len(self._store):
-            bigger = np.zeros(max(2 * len(self._store), size), ENTRY)
-            bigger[: self._size] = self._store[: self._size]
-            self._store = bigger
-        self._store[self._size : size] = entries
+        size, capacity = self._size + len(entries), len(self._store)
+        if size > capacity:
+            self._entries.grow(max(capacity, size - capacity))
+        self._entries.write(np.arange(self._size, size), entries)
         self._size = size
 
     def hand_over(self, keyframe_id: int, parent_id: int, T_parent_keyframe: Array) -> None:
@@ -90,7 +89,17 @@ class FrameHistory:
         """Give the frames the poses that the camera's inertia makes the most probable."""
         for _, rows, origins, measured in self._segments(world):
             found = smooth(measured, self._store["information"][rows])
-            self._store["T_keyframe_camera"][rows] = inverse(origins) @ found.poses_world_camera
+            entries = self._store[rows]
+            entries["T_keyframe_camera"] = inverse(origins) @ found.poses_world_camera
+            self._entries.write(rows, entries)
+
+    def release_memory(self) -> None:
+        """Give back the memory of what was read from the disk."""
+        self._entries.release()
+
+    @property
+    def _store(self) -> Entries:
+        return self._entries.rows
 
     def place(self, world: WorldMap, path: Trajectory) -> None:
         """Give the frames that have these stamps these poses T_world_camera."""
@@ -168,13 +177,14 @@ class FrameHistory:
 
     def restore(self, state: Arrays) -> None:
         """Become the history of a state. Raises ValueError for keyframes in a circle."""
-        self._size = len(state["timestamps_s"])
-        self._store = np.zeros(max(self._size, 1024), ENTRY)
-        if len(state["information"]) != self._size:  # of a file that was written without
-            state = {**state, "information": np.broadcast_to(UNKNOWN, (self._size, 6, 6))}
+        self._size, size = 0, len(state["timestamps_s"])
+        if len(state["information"]) != size:  # of a file that was written without
+            state = {**state, "information": np.broadcast_to(UNKNOWN, (size, 6, 6))}
+        entries = np.zeros(size, ENTRY)
         columns = ("timestamps_s", "keyframe_ids", "T_keyframe_camera", "information")
         for name, column in zip(ENTRY.names or (), columns, strict=True):
-            self._store[name][: self._size] = state[column]
+            entries[name] = state[column]
+        self.extend(entries)
         parents = zip(state["heir_ids"].tolist(), state["T_heir_culled"], strict=True)
         self._parent = dict(zip(state["culled_ids"].tolist(), parents, strict=True))
         TopologicalSorter({k: (parent,) for k, (parent, _) in self._parent.items()}).prepare()

@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.features.patch_alignment import PATCH_PX
-from bmask_slam.graph.arrays import Array, Arrays, Bytes, Image, Ints, Mask
+from bmask_slam.graph.arrays import Array, Arrays, Bytes, Ints, Mask
 from bmask_slam.graph.files.array_file import check_ids
+from bmask_slam.graph.files.disk_arrays import concatenated
 from bmask_slam.graph.geometry import inverse, transform
+from bmask_slam.world.appearance import (
+    APPEARANCE,
+    PATCHES,
+    Appearance,
+    AppearanceTable,
+    Columns,
+    Patches,
+    filled,
+)
 
-PATCHES = 4  # of a landmark: views from one walk past it, of which each patch serves a range
-
-_Columns = dict[str, tuple[tuple[int, ...], type, float]]
-
-_APPEARANCE: _Columns = {
-    "descriptors": ((8,), np.uint64, 0),
-    "directions": ((3,), np.float64, 0.0),
-    "extent": ((), np.float64, 0.0),
-    "angles_rad": ((), np.float64, 0.0),
-    "colours": ((3,), np.uint8, 0),
-    "patches": ((PATCHES, PATCH_PX, PATCH_PX), np.uint8, 0),
-    "patch_views": ((PATCHES, 3), np.float64, np.nan),
-}
-"""Columns that only landmarks in the map have: most landmarks are removed soon."""
-_OF_ALL: _Columns = {
+_OF_ALL: Columns = {
     "points_world": ((3,), np.float64, np.nan),
     "host": ((), np.int64, -1),
     "last_keyframe": ((), np.int64, -1),
@@ -38,52 +31,9 @@ _OF_ALL: _Columns = {
     "in_map": ((), np.bool_, False),
     "in_graph": ((), np.bool_, False),
 }
-_COLUMNS = _OF_ALL | _APPEARANCE
-_ROW: _Columns = {"row": ((), np.int64, 0)}
-
-
-class Appearance:
-    """A column over landmark ids that has rows only for landmarks in the map.
-
-    Row 0 is a placeholder for all removed landmarks: it stays zero when it is written.
-    """
-
-    def __init__(self, rows: NDArray, row: Ints) -> None:
-        self._rows, self._row_of = rows, row
-
-    def __len__(self) -> int:
-        return len(self._row_of)
-
-    def __getitem__(self, ids: Any) -> NDArray:
-        return self._rows[self._row_of[ids]]
-
-    def __setitem__(self, ids: Any, values: Any) -> None:
-        placeholder = self._rows[0].copy()
-        self._rows[self._row_of[ids]] = values
-        self._rows[0] = placeholder
-
-    def pick(self, ids: Ints, which: Ints) -> NDArray:
-        """Entry which[k] of the row of ids[k]."""
-        return self._rows[self._row_of[ids], which]
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
-        return np.array(self._rows[self._row_of], dtype)
-
-
-@dataclass(frozen=True, eq=False)
-class Patches:
-    """Image patches of some landmarks, for sub-pixel registration; see LandmarkTable.
-
-    Attributes:
-        images: (N, PATCHES, 17, 17) uint8.
-        views: (N, PATCHES, 3) m, NaN where there is none.
-    """
-
-    images: Image
-    views: Array
-
-    def __getitem__(self, rows: Any) -> Patches:
-        return Patches(self.images[rows], self.views[rows])
+_COLUMNS = _OF_ALL | APPEARANCE
+BLOCK = 4096  # landmarks whose appearance is copied at once
+_ROW: Columns = {"row": ((), np.int64, 0)}
 
 
 class LandmarkTable:
@@ -130,9 +80,8 @@ class LandmarkTable:
 
     def __init__(self) -> None:
         self._size = 0
-        self._store = {name: _filled(1024, column) for name, column in (_OF_ALL | _ROW).items()}
-        self._appearance = {name: _filled(1, column) for name, column in _APPEARANCE.items()}
-        self._free: list[int] = []
+        self._store = {name: filled(1024, column) for name, column in (_OF_ALL | _ROW).items()}
+        self._appearance = AppearanceTable()
         self._make_views()
 
     def __len__(self) -> int:
@@ -247,11 +196,20 @@ class LandmarkTable:
         T_move = (T_new @ inverse(T_old))[position]
         self.points_world[ids] = transform(T_move, self.points_world[ids][:, None])[:, 0]
 
+    def release_memory(self) -> None:
+        """Give back the memory of patches that were read from the disk."""
+        self._appearance.release_memory()
+
     def state(self) -> Arrays:
         """The landmarks in the map; of removed ones only the number is kept."""
         ids = np.flatnonzero(self.in_map)
-        columns = {name: getattr(self, name)[ids] for name in _COLUMNS if name != "in_map"}
+        columns = {name: self._rows_of(ids, name) for name in _COLUMNS if name != "in_map"}
         return {"size": np.array(self._size), "ids": ids, **columns}
+
+    def _rows_of(self, ids: Ints, name: str) -> NDArray:
+        column = getattr(self, name)
+        pieces = (column[ids[k : k + BLOCK]] for k in range(0, len(ids), BLOCK))
+        return concatenated(pieces, len(ids), column[ids[:0]])
 
     def restore(self, state: Arrays) -> None:
         """Become the table of a state; this table must be new. Raises ValueError."""
@@ -265,36 +223,18 @@ class LandmarkTable:
 
     def _assign_rows(self, ids: Ints) -> None:
         """Assign rows of the appearance to landmarks (N,) that have none."""
-        missing = len(ids) - len(self._free)
-        if missing > 0:
-            capacity = len(self._appearance["extent"])
-            more = max(missing, capacity // 4)  # a row takes 1.4 kB
-            for name, column in _APPEARANCE.items():
-                self._appearance[name] = np.concatenate(
-                    [self._appearance[name], _filled(more, column)]
-                )
-            self._free += range(capacity + more - 1, capacity - 1, -1)
+        if self._appearance.reserve(len(ids)):
             self._make_views()
-        if len(ids):
-            self.row[ids] = self._free[-len(ids) :][::-1]
-            del self._free[-len(ids) :]
+        self.row[ids] = self._appearance.take(len(ids))
 
     def _release_rows(self, ids: Ints) -> None:
         """Release the rows of landmarks (N,), each given once, and set them to zero."""
         used = self.row[ids]
-        used = used[used > 0]
-        for name, (_, _, fill) in _APPEARANCE.items():
-            self._appearance[name][used] = fill
         self.row[ids] = 0
-        self._free += used[::-1].tolist()
+        self._appearance.clear(used[used > 0])
 
     def _make_views(self) -> None:
         for name, array in self._store.items():
             setattr(self, name, array[: self._size])
-        for name, rows in self._appearance.items():
-            setattr(self, name, Appearance(rows, self.row))
-
-
-def _filled(count: int, column: tuple[tuple[int, ...], type, float]) -> NDArray:
-    shape, dtype, fill = column
-    return np.full((count, *shape), fill, dtype)
+        for name, column in self._appearance.views(self.row).items():
+            setattr(self, name, column)

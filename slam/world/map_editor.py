@@ -10,8 +10,8 @@ from typing import Protocol
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Ints, Mask
 from bmask_slam.graph.sensors.odometry import MotionSensor
+from bmask_slam.world.appearance import Patches
 from bmask_slam.world.frame_history import FrameHistory
-from bmask_slam.world.landmark_table import Patches
 from bmask_slam.world.world_map import WorldMap
 
 

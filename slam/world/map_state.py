@@ -10,6 +10,7 @@ import numpy as np
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.files.array_file import check_ids, nested, part, split_rows
+from bmask_slam.graph.files.disk_arrays import concatenated
 from bmask_slam.world.landmark_table import LandmarkTable
 from bmask_slam.world.world_map import CulledKeyframe, Keyframe, WorldMap
 
@@ -85,7 +86,10 @@ def world_of(state: Arrays) -> WorldMap:
     if keypoints["landmark_ids"].max(initial=-1) >= len(landmarks.host):
         raise ValueError("a keypoint on a landmark that is not there")
     culled = _culled_of(part(state, "culled"))
-    return WorldMap(keyframes, landmarks, int(state["next_keyframe_id"]), culled)
+    world = WorldMap(keyframes, landmarks, int(state["next_keyframe_id"]), culled)
+    for keyframe in keyframes.values():
+        world.store_features(keyframe)
+    return world
 
 
 def _culled_state(culled: dict[int, CulledKeyframe]) -> Arrays:
@@ -101,9 +105,8 @@ def _culled_of(state: Arrays) -> dict[int, CulledKeyframe]:
 
 def _joined(objects: Sequence[Any], columns: _Columns) -> Arrays:
     """Each column of several objects, one after the other; typed where there are none."""
-    return {
-        name: np.concatenate(
-            [np.zeros((0, *shape), dtype), *(getattr(o, name) for o in objects)], dtype=dtype
-        )
-        for name, (shape, dtype) in columns.items()
-    }
+    found: Arrays = {}
+    for name, (shape, dtype) in columns.items():
+        pieces = [getattr(o, name) for o in objects]
+        found[name] = concatenated(pieces, sum(map(len, pieces)), np.zeros((0, *shape), dtype))
+    return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -11,10 +11,12 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.features.patch_alignment import SubpixelConfig, cut_patches
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.disk_arrays import DiskRecords
 from bmask_slam.graph.geometry import inverse, so3_log, transform
 from bmask_slam.world.landmark_table import LandmarkTable
 
 MAX_CULLED = 500
+_COLUMNS = [f.name for f in fields(Features) if f.name != "gray"]
 
 
 @dataclass
@@ -71,11 +73,23 @@ class WorldMap:
     landmarks: LandmarkTable = field(default_factory=LandmarkTable)
     next_keyframe_id: int = 0
     culled: dict[int, CulledKeyframe] = field(default_factory=dict)
+    _disk: DiskRecords = field(default_factory=DiskRecords, repr=False, compare=False)
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Add a keyframe; its id must be ``next_keyframe_id``."""
         self.keyframes[keyframe.id] = keyframe
         self.next_keyframe_id = keyframe.id + 1
+
+    def store_features(self, keyframe: Keyframe) -> None:
+        """Move a keyframe's features to the disk, without their grey image."""
+        features = keyframe.features
+        arrays = self._disk.stored({name: getattr(features, name) for name in _COLUMNS})
+        keyframe.features = Features(**arrays, gray=np.zeros((0, 0), np.uint8))
+
+    def release_memory(self) -> None:
+        """Give back the memory of what was read from the disk since the last call."""
+        self._disk.release()
+        self.landmarks.release_memory()
 
     def in_segment(self, segment: int) -> list[Keyframe]:
         """The keyframes of one map segment, oldest first."""

@@ -18,6 +18,7 @@ from bmask_slam.graph.arrays import Array, Arrays, Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
+from bmask_slam.graph.files.disk_arrays import DiskRows
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.graph.smoother.storage import graph_arrays
 from bmask_slam.labelling.semantic_mapper import kept_depth
@@ -30,10 +31,11 @@ from bmask_slam.semantics.tracks.instance_track import Sighting
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.system_results import OPTIONAL_ARRAYS
-from bmask_slam.world.landmark_table import PATCHES, LandmarkTable, Patches
+from bmask_slam.world.appearance import PATCHES, Patches
+from bmask_slam.world.landmark_table import LandmarkTable
 
 FILE = Path("run/checkpoint")
-SCRATCH = {"elapsed_s", "stage_ms"}  # mean nothing between two frames
+SCRATCH = {"elapsed_s", "stage_ms", "_disk"}  # mean nothing between two frames
 OPAQUE = ("cv2", "gtsam", "faiss")  # made anew from configuration or state
 SETTINGS = [  # a keyframe nearly every frame, and most of them culled again
     *("keyframes.min_interval_frames=1", "keyframes.max_shared=2.0"),
@@ -150,6 +152,8 @@ def differences(a: Any, b: Any, where: str = "system") -> Iterator[str]:
             yield from differences(a[key], b[key], f"{where}[{key}]")
     elif isinstance(a, FactorTables):  # rows and slots are its own affair
         yield from differences(graph_arrays(a), graph_arrays(b), where)
+    elif isinstance(a, DiskRows):
+        yield from differences(a.rows, b.rows, where)
     elif isinstance(a, LandmarkTable):  # dead landmarks are not kept
         yield from differences(a.state(), b.state(), where)
     elif type(a).__module__.partition(".")[0] not in OPAQUE:
@@ -261,6 +265,6 @@ def test_compared_classes_have_only_compared_attributes(system: SlamSystem) -> N
     }
     rows = {"of_keyframe", "of_landmark", "_free", "_columns", "_slots", "_used"}
     assert vars(tables.observations).keys() == rows
-    columns = table._store.keys() | table._appearance.keys()
-    assert vars(table).keys() == {"_size", "_store", "_appearance", "_free", *columns}
+    columns = table._store.keys() | table._appearance.views(table.row).keys()
+    assert vars(table).keys() == {"_size", "_store", "_appearance", *columns}
     assert columns - {"in_map", "row"} == table.state().keys() - {"size", "ids"}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bmask_slam.back_end.map_backend import add_keyframe, without_image
+from bmask_slam.back_end.map_backend import add_keyframe
 from bmask_slam.events import Event, EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Array, Ints, Mask
@@ -37,8 +37,8 @@ from bmask_slam.sensing.sensor_fusion import SensorFusion
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import Tracked
+from bmask_slam.world.appearance import Patches
 from bmask_slam.world.frame_history import NO_KEYFRAME, Entries, FrameHistory
-from bmask_slam.world.landmark_table import Patches
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 SAVE_EVERY = 20
@@ -110,7 +110,7 @@ class RemoteMapper:
         """
         reference = self.reference
         keyframe = add_keyframe(self.world, frame, tracked, segment)
-        keyframe.features = without_image(keyframe.features)
+        self.world.store_features(keyframe)
         keyframe.landmark_ids[tracked.keypoints] = tracked.landmark_ids
         self.places.add(keyframe.id, keyframe.features.descriptors)
         self._pending.add(keyframe.id)
@@ -254,6 +254,8 @@ class RemoteMapper:
         if not message.done:
             return
         self.update_ms.append(message.update_ms)
+        self.world.release_memory()
+        self.history.release_memory()
         self._pending -= set(message.delta.keyframe_ids.tolist()) | {message.keyframe_id}
         if message.keyframe_id + 1 - self._saved_keyframes >= SAVE_EVERY:
             self._saved_keyframes = message.keyframe_id + 1

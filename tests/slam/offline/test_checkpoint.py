@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from fake_run import FakeSystem, make_sequence, signal_at
 
+from bmask_slam.evaluation import plot
 from bmask_slam.events import EventKind, read_events
 from bmask_slam.graph.errors import InputError
 from bmask_slam.offline.runner import RunOptions, resume, run
-from bmask_slam.run_folder import metrics as run_results
 from bmask_slam.run_folder.folder import CHECKPOINT, FILES, GROWING, RunFolder
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.tracker import TrackingConfig
@@ -35,7 +35,7 @@ def sequence(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def quick_plots(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_results, "plot_trajectory", lambda path, *_: path.write_text("quick"))
+    monkeypatch.setattr(plot, "plot_trajectory", lambda path, *_: path.write_text("quick"))
 
 
 def options(sequence: Path, out: Path, **more: object) -> RunOptions:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_run import FakeSystem, make_sequence
 
 from bmask_slam.calibration.adoption import (
     BENDS,
@@ -28,7 +30,7 @@ from bmask_slam.graph.calibration.cross_validation import CrossValidation
 from bmask_slam.graph.calibration.model import BEND, LENS, PARAMETERS, SHUTTER, TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.offline import checkpoint, runner
+from bmask_slam.offline import checkpoint, frame_loop, runner
 from bmask_slam.offline.runner import RunOptions, RunSummary, resume, run
 from bmask_slam.offline.self_calibration import RememberingSegmenter, SelfCalibrator
 from bmask_slam.run_folder.map_file import read_run
@@ -325,3 +327,29 @@ def test_two_rounds_are_extrapolated() -> None:
     assert third[SHUTTER] == pytest.approx(truth, abs=1e-9)
     assert third[TIME] == 0.0
     assert estimate(third[SHUTTER]).settled([SHUTTER]) and not second.settled([SHUTTER])
+
+
+def test_a_run_that_begins_anew_frees_the_system_of_before(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A whole map, and its graph, would else be kept until the end."""
+    systems: list[weakref.ref[FakeSystem]] = []
+
+    def make(camera: Camera, config: SystemConfig) -> FakeSystem:
+        system = FakeSystem(camera, config)
+        system.itself = system  # as parts of a system know each other
+        systems.append(weakref.ref(system))
+        return system
+
+    alive: list[int] = []
+
+    def process(run: frame_loop.ActiveRun) -> bool:
+        alive.append(sum(system() is not None for system in systems))
+        return len(alive) < 3
+
+    folder = make_sequence(tmp_path / "seq")
+    monkeypatch.setattr(runner, "process_frames", process)
+    monkeypatch.setattr(runner, "finish_run", lambda run: run)
+    run(RunOptions(folder, out=tmp_path / "out", quiet=True), make)
+    assert alive == [1, 1, 1]
+    assert len(systems) == 3

@@ -96,7 +96,7 @@ def test_descriptor_rows_of_removed_landmarks_are_reused() -> None:
     first = table.add(columns(500))
     table.descriptors[first] = RNG.integers(0, 1 << 60, (500, 8), dtype=np.uint64)
     kept = table.descriptors[first[::2]]
-    rows = len(table._appearance["descriptors"])
+    rows = len(table._appearance)
     for _ in range(20):
         dead = table.add(columns(200))
         table.descriptors[dead] = 5
@@ -110,7 +110,7 @@ def test_descriptor_rows_of_removed_landmarks_are_reused() -> None:
     assert (table.descriptors[newest] == 0).all()
     np.testing.assert_array_equal(table.descriptors[first[::2]], kept)
     assert len(table) == 4800
-    assert len(table._appearance["descriptors"]) <= 2 * rows
+    assert len(table._appearance) <= 2 * rows
 
 
 def test_a_copy_gets_the_current_landmarks() -> None:

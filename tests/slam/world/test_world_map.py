@@ -16,7 +16,7 @@ from bmask_slam.features.brisk import BriskExtractor, FeatureConfig
 from bmask_slam.features.patch_alignment import PATCH_PX, SubpixelConfig, cut_patches
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
-from bmask_slam.world.landmark_table import PATCHES
+from bmask_slam.world.appearance import PATCHES
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 RNG = np.random.default_rng(12)
