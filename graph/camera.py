@@ -167,6 +167,11 @@ class Camera:
     def _centre(self) -> Array:
         return np.array([self.cx, self.cy])
 
+    def depth_bend(self, pixels: Array) -> Array:
+        """What the sensor adds to the inverse depth (...) at raw pixels (..., 2), in 1/m."""
+        terms = depth_distortion_terms(self.image_places(pixels))
+        return np.asarray(terms @ np.array(self.depth_distortion))
+
     def project_stereo(self, points_camera: Array) -> Array:
         """Stereo measurements (..., 3) ``(u_left, v, u_right)`` of camera points (..., 3)."""
         uv = self.project(points_camera)

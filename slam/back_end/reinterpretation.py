@@ -1,4 +1,4 @@
-"""Observations of keyframes as a camera with other times gives them: readout, and depth delay."""
+"""Observations of keyframes as another camera gives them: readout, delay and bend of depth."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class KeyframeMotion:
 
 
 def use_camera(mapper: Mapper, camera: Camera, motions: Mapping[int, KeyframeMotion]) -> None:
-    """Let a map go on with a camera of other times; keyframes of known motion follow it."""
+    """Let a map go on with another camera; keyframes of known motion follow it."""
     keyframes = mapper.world.keyframes
     for number in sorted(motions.keys() & keyframes.keys()):
         reinterpret(keyframes[number], motions[number], mapper.camera, camera)
@@ -58,13 +58,15 @@ def reinterpret(keyframe: Keyframe, motion: KeyframeMotion, old: Camera, new: Ca
     """
     features, known = keyframe.features, Motion(motion.twist, 0.0)
     depth_m = _as_exposed_m(features, motion.twist, old)
+    pixels = features.image_pixels
+    depth_m /= 1 + depth_m * (old.depth_bend(pixels) - new.depth_bend(pixels))
     rows, change = motion.keypoints, motion.inverse_depth_change
     share = depth_m[rows] * change
     usable = np.abs(share) < MAX_CHANGE  # False for NaN
     depth_m[rows[usable]] /= 1 + share[usable]
     raw = replace(
         features,
-        pixels=new.undistort(features.image_pixels),
+        pixels=new.undistort(pixels),
         depth_m=depth_m,
         disparity_px=new.stereo_bf_px_m / depth_m,
     )

@@ -7,10 +7,8 @@ What was found is adopted if it is observable, differs from what the camera has,
 halves of the observations, and fits the half that it was not estimated from better by two standard
 errors (`graph.calibration.cross_validation`).
 
-A run with a wrong camera has matched what fits that camera, which draws the estimate towards it. An
-offline run therefore searches its landmarks again (`calibration.rematching`); where that cannot be
-done, estimates are made in rounds, each from frames tracked with what the round before found, until
-that changes no more.
+A run with a wrong camera has matched what fits that camera, which draws the estimate towards it. So
+its landmarks are searched again (`calibration.rematching`).
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ import numpy as np
 
 from bmask_slam.calibration.calibrate import camera_from, with_rate_error
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.calibration.calibration import CalibrationResult, calibrate
+from bmask_slam.graph.calibration.calibration import CalibrationResult
 from bmask_slam.graph.calibration.cross_validation import CrossValidation, cross_validate
 from bmask_slam.graph.calibration.model import BEND, PARAMETERS, SHUTTER, TIME, parameters_of
 from bmask_slam.graph.calibration.problem import CalibrationProblem
@@ -39,7 +37,8 @@ FREE = (*TIMES, *BENDS)
 CALIBRATE = ("auto", "report", "off")
 """Whether what is found is used, only told, or not looked for."""
 NAMES = {SHUTTER: "rolling shutter", TIME: "colour-depth delay"}
-MIN_STEP_S, MAX_SHARE, MAX_S = 0.002, 0.6, 0.035
+MAX_S = 0.035
+UNOBSERVABLE = "readout, delay and bend of depth not observable in the motion"
 PLACES = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-0.75, 0.75, 7)), axis=-1)
 BEND_TERMS = depth_distortion_terms(PLACES).reshape(-1, len(BENDS))
 """Those of the distortion of depth at places all over an image of 4:3."""
@@ -50,11 +49,10 @@ class SelfCalibrationConfig:
     """How much is tracked, and when something is adopted.
 
     Attributes:
-        frames: after which an offline run is looked at first; then after twice and four times as
-            many, as long as the motion does not show the parameters.
+        frames: after which a run is looked at first; then after twice and four times as many, as
+            long as the motion does not show the parameters.
         min_frames: fewer are not looked at, at the end of a sequence.
         stretches: how often it is looked at in vain at most.
-        rounds: number of estimates of a live run at most.
         max_sigma_s: largest standard deviation of a parameter that counts as observable.
         min_change_sigmas: what is adopted differs by so many standard deviations,
         min_change_s: and by so much.
@@ -67,7 +65,6 @@ class SelfCalibrationConfig:
     frames: int = 210
     min_frames: int = 90
     stretches: int = 3
-    rounds: int = 4
     max_sigma_s: float = 0.004
     min_change_sigmas: float = 3.0
     min_change_s: float = 0.002
@@ -92,7 +89,7 @@ class SelfCalibration:
         given: the camera before.
         camera: to run with, that one if nothing is adopted.
         text: one line for the summary and the log; "" if nothing could be said.
-        looks: how often an offline run was looked at in vain.
+        looks: how often the run was looked at in vain.
         settled: whether it needs no other look.
     """
 
@@ -132,11 +129,6 @@ class Estimate:
         sigma = _rms_sigma(self.sigmas[BEND]) if i in BENDS else self.sigmas[i]
         return bool(0 < sigma < config.limits(i)[0])
 
-    def settled(self, chosen: list[int]) -> bool:
-        """Whether the run found what its camera had, within 95 % bounds of two rounds."""
-        bounds = np.maximum(1.96 * np.sqrt(2) * self.sigmas[chosen], MIN_STEP_S)
-        return bool((np.abs(self.found - self.before)[chosen] <= bounds).all())
-
     def agrees(self, i: int, halves: CrossValidation, config: SelfCalibrationConfig) -> bool:
         """Whether both halves alone find a parameter: within their bounds, or nearer to what was
         found than to what the camera has. The distortion of depth is compared over the image.
@@ -168,65 +160,39 @@ def _rms_sigma(sigmas: Array) -> float:
     return float(np.sqrt(np.mean(BEND_TERMS**2 @ sigmas**2)))
 
 
-def estimate_times(problem: CalibrationProblem) -> Estimate:
-    """What the observations of a problem say of a camera's times."""
-    return estimate_of(problem, calibrate(problem))
-
-
 def estimate_of(problem: CalibrationProblem, result: CalibrationResult) -> Estimate:
     """The estimate of a problem that was solved."""
     sigmas = np.sqrt(np.diag(with_rate_error(result).covariance))
     return Estimate(problem.calibration, result.calibration, sigmas, problem)
 
 
-class CalibrationRounds:
-    """Takes one estimate a round; says which camera to track with next, and what is adopted.
+def judged(
+    state: SelfCalibration,
+    estimate: Estimate,
+    mode: str,
+    config: SelfCalibrationConfig,
+    free: tuple[int, ...] = FREE,
+) -> SelfCalibration:
+    """The state after an estimate. What was adopted is not estimated again.
 
-    Args:
-        given: the camera of the first round.
-        free: the parameters that may be adopted, by their places in PARAMETERS.
+    A parameter that does not show yet is looked for again later, unless one was adopted. Only those
+    of ``free`` may be; with a mode other than "auto" it is only told.
     """
-
-    def __init__(
-        self,
-        given: Camera,
-        config: SelfCalibrationConfig | None = None,
-        free: tuple[int, ...] = TIMES,
-    ) -> None:
-        self._given, self._config, self._free = given, config or SelfCalibrationConfig(), free
-        self._sure: list[int] = []
-        self._rounds: list[Estimate] = []
-
-    def shows(self, estimate: Estimate) -> bool:
-        """Whether the motion of a stretch shows any of the parameters."""
-        return any(estimate.shows(i, self._config) for i in TIMES)
-
-    def add(self, estimate: Estimate) -> Camera | None:
-        """Add the estimate of a round; the camera to track the next one with, None at the end."""
-        tried = [i for i in self._free if i not in self._sure]
-        more = newly_sure(estimate, tried, self._config)
-        settled = bool(self._rounds) and not more and estimate.settled(self._sure)
-        self._rounds.append(estimate)
-        self._sure += more
-        if not self._sure or settled or len(self._rounds) == self._config.rounds:
-            return None
-        return camera_with(self._given, next_start(self._rounds), self._sure)
-
-    def result(self) -> SelfCalibration:
-        """What the rounds together say of the given camera."""
-        given, config = self._given, self._config
-        start = parameters_of(given, given.depth_scale)
-        final = dataclasses.replace(self._rounds[-1], before=start)
-        kept = [i for i in self._sure if final.differs(i, config)]
-        if not kept:
-            return SelfCalibration(given, given, format_found(final, TIMES, self._refused(final)))
-        camera = camera_with(given, final.found, kept)
-        return SelfCalibration(given, camera, format_found(final, kept, "found and applied"))
-
-    def _refused(self, estimate: Estimate) -> str:
-        """Why nothing is adopted."""
-        differs = any(estimate.differs(i, self._config) for i in TIMES)
-        return "not sure enough to be applied" if differs else "the camera keeps its values"
+    sure = [i for i in newly_sure(estimate, FREE, config) if i in free]
+    if sure:
+        verdict = "found and applied" if mode == "auto" else "found, not applied"
+        text = format_found(estimate, sure, verdict)
+        if mode != "auto":
+            return dataclasses.replace(state, text=text, settled=True)
+        camera = camera_with(state.given, estimate.found, sure)
+        return dataclasses.replace(state, camera=camera, text=text, settled=True)
+    seen = [i for i in free if estimate.shows(i, config)]
+    differs = any(estimate.differs(i, config) for i in free)
+    verdict = "not sure enough to be applied" if differs else "the camera keeps it"
+    text = format_found(estimate, seen, verdict) if seen else UNOBSERVABLE
+    settled = len(seen) == np.count_nonzero(estimate.sigmas[list(free)]) and not differs
+    looks = state.looks + 1
+    return dataclasses.replace(state, text=text, looks=looks, settled=settled)
 
 
 def newly_sure(
@@ -248,20 +214,6 @@ def newly_sure(
         possible = np.abs(estimate.found[BEND]).max() < config.max_bend
         agreed = agreed | set(BENDS) if possible else agreed - set(BENDS)
     return sorted(agreed)
-
-
-def next_start(rounds: list[Estimate]) -> Array:
-    """The vector (18,) to track with after some rounds.
-
-    A run with a camera that is off by d finds one that is off by a share r of d, which two rounds
-    show; what it tends to is x + (found - x) / (1 - r) (Aitken's extrapolation).
-    """
-    last = rounds[-1]
-    if len(rounds) == 1:
-        return last.found
-    moved, changed = last.before - rounds[-2].before, last.found - rounds[-2].found
-    share = np.divide(changed, moved, out=np.zeros(len(moved)), where=np.abs(moved) > MIN_STEP_S)
-    return last.before + (last.found - last.before) / (1 - np.clip(share, 0.0, MAX_SHARE))
 
 
 def camera_with(camera: Camera, values: Array, chosen: list[int]) -> Camera:

@@ -11,7 +11,7 @@ import numpy as np
 from bmask_slam.calibration.motion import landmark_motion
 from bmask_slam.calibration.priors import CalibrationPriors
 from bmask_slam.calibration.report import Calibrated, format_calibration, parameters_named
-from bmask_slam.calibration.views import connected_views, make_views
+from bmask_slam.calibration.views import SequenceDepths, connected_views, make_views
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.calibration.calibration import CalibrationResult, calibrate
 from bmask_slam.graph.calibration.model import (
@@ -149,8 +149,8 @@ def make_problem(
 ) -> tuple[CalibrationProblem, Ints]:
     """The problem for the solver, and the ids (K,) of its keyframes."""
     stamps_s = dict(zip(run.tables.keyframes.ids.tolist(), run.keyframe_stamps_s, strict=True))
-    frames = frames_of(stamps_s, sequence)
-    observations = connected_views(run.tables, np.array(sorted(frames), np.int64), MAX_KEYFRAMES)
+    reader = SequenceDepths(stamps_s, sequence)
+    observations = connected_views(run.tables, reader.keyframe_ids, MAX_KEYFRAMES)
     count = len(np.unique(observations.keyframe_ids))
     if count < MIN_KEYFRAMES:
         raise InputError(
@@ -158,7 +158,7 @@ def make_problem(
             f"at least {MIN_KEYFRAMES}, better 20 or more"
         )
     motion = landmark_motion(observations, run)
-    views, keyframe_ids, landmark_ids = make_views(observations, frames, sequence, motion)
+    views, keyframe_ids, landmark_ids = make_views(observations, reader, motion)
     poses = run.tables.keyframes.get(keyframe_ids)
     points = run.tables.landmarks.get(landmark_ids)
     stamps = np.array([stamps_s[k] for k in keyframe_ids.tolist()])
@@ -182,14 +182,6 @@ def make_problem(
         views, poses, points, start, sigmas, gauge, anchors if has_anchor else None
     )
     return problem, keyframe_ids
-
-
-def frames_of(stamps_s: dict[int, float], sequence: Sequence) -> dict[int, int]:
-    """Index in the sequence of every keyframe whose stamp the sequence has."""
-    known = {k: s for k, s in stamps_s.items() if np.isfinite(s)}
-    at = nearest_indices(sequence.timestamps_s, np.array(list(known.values())))
-    near = np.abs(sequence.timestamps_s[at] - np.array(list(known.values()))) < 1e-5
-    return {k: i for k, i, ok in zip(known, at.tolist(), near, strict=True) if ok}
 
 
 def _reference_positions(path: Path, stamps_s: Array, poses: Array) -> tuple[Array, Array]:

@@ -17,12 +17,11 @@ from bmask_slam.calibration.adoption import FREE, TIMES, Estimate, estimate_of
 from bmask_slam.calibration.calibrate import (
     GAUGE_SIGMAS,
     MIN_KEYFRAMES,
-    frames_of,
 )
 from bmask_slam.calibration.motion import MIN_DEPTH_M, twists_at
 from bmask_slam.calibration.priors import estimated_priors
 from bmask_slam.calibration.views import (
-    MAX_STEP_SIGMAS,
+    DepthReader,
     Depths,
     connected_views,
     group_sizes,
@@ -44,7 +43,6 @@ from bmask_slam.graph.calibration.problem import CalibrationProblem
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.run_folder.map_file import SavedRun
-from bmask_slam.sequences import Sequence
 from bmask_slam.tracking.rolling_shutter import share_of_rows, velocities
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
@@ -178,19 +176,16 @@ class RunProblem:
 
     Args:
         world, run: of the same system, at the same moment.
-        sequence: its frames, with the camera that it has.
+        reader: depth images of its keyframes.
 
     Raises:
         InputError: a keyframe's depth image is missing or broken.
     """
 
-    def __init__(self, world: WorldMap, run: SavedRun, sequence: Sequence) -> None:
-        stamps_s = {k.id: k.timestamp_s for k in world.keyframes.values()}
-        self._frames = frames_of(stamps_s, sequence)
-        ids = np.array(sorted(self._frames), np.int64)
-        seen = connected_views(run.tables, ids, MAX_KEYFRAMES)
+    def __init__(self, world: WorldMap, run: SavedRun, reader: DepthReader) -> None:
+        seen = connected_views(run.tables, reader.keyframe_ids, MAX_KEYFRAMES)
         seen = seen.select(world.landmarks.in_map[seen.landmark_ids])
-        self._sequence, self._camera = sequence, run.camera
+        self._reader, self._camera = reader, run.camera
         self._keyframe_ids = np.unique(seen.keyframe_ids)
         landmark_ids, views = np.unique(seen.landmark_ids, return_counts=True)
         most = np.argsort(-views, kind="stable")
@@ -248,11 +243,10 @@ class RunProblem:
         """Depth measurements at keypoints; those of the first round only, later ones have none."""
         if self._depths is None:
             measured = Depths.missing(len(found))
-            max_step = MAX_STEP_SIGMAS * sigmas
             for row, keyframe_id in enumerate(self._keyframe_ids.tolist()):
-                rows, index = np.flatnonzero(found.keyframes == row), self._frames[keyframe_id]
-                pixels = found.pixels[rows]
-                measured.measure(rows, pixels, self._sequence, index, max_step[rows])
+                rows = np.flatnonzero(found.keyframes == row)
+                at = found.pixels[rows], sigmas[rows]
+                measured.put(rows, self._reader.measure(keyframe_id, *at))
             self._depths = found.keys, measured
         keys, measured = self._depths
         order = np.argsort(keys, kind="stable")
@@ -261,16 +255,16 @@ class RunProblem:
 
 
 def estimate_again(
-    world: WorldMap, run: SavedRun, sequence: Sequence, worth_s: float
+    world: WorldMap, run: SavedRun, reader: DepthReader, worth_s: float
 ) -> Estimate | None:
-    """What a run's keyframes say of the camera's times; None if they are too few.
+    """What a run's keyframes say of its camera; None if they are too few.
 
     If the first round changes neither time by ``worth_s``, there is no other.
 
     Raises:
         InputError: a keyframe's depth image is missing or broken.
     """
-    problems = RunProblem(world, run, sequence)
+    problems = RunProblem(world, run, reader)
     if not problems.large_enough:
         return None
     shutter_s, estimate = run.camera.rolling_shutter_s, None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections import deque
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from bmask_slam.graph.calibration.model import CalibrationViews
 from bmask_slam.graph.camera import NO_DEPTH_DISTORTION, Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations
+from bmask_slam.graph.trajectory import nearest_indices
 from bmask_slam.sequences import Sequence
 from bmask_slam.sequences.images import SURFACE_STEP
 from bmask_slam.tracking.rolling_shutter import share_of_rows
@@ -28,6 +30,7 @@ MIN_WINDOW_SHARE = 0.6
 MAX_STEP_SIGMAS = 4.0
 """A window shows one smooth surface if all pixels are within so many sensor sigmas of its plane."""
 MAX_RATE_STEP_S = 0.2
+MAX_LATE_S = 1e-5
 
 
 def connected_views(tables: FactorTables, keyframe_ids: Ints, most: int) -> Observations:
@@ -82,26 +85,25 @@ def _largest_part(observations: Observations) -> list[int]:
 
 
 def make_views(
-    observations: Observations, frames: dict[int, int], sequence: Sequence, motion: LandmarkMotion
+    observations: Observations, reader: SequenceDepths, motion: LandmarkMotion
 ) -> tuple[CalibrationViews, Ints, Ints]:
     """The views of a run, and the ids (K,) and (L,) of keyframes and landmarks.
 
-    ``frames`` holds each keyframe's index in the sequence, whose camera must be the run's. Pixels
-    get back the distortion and the rolling shutter of the image; depths are read again from the
-    raw depth images.
+    The camera of the reader's sequence must be the run's. Pixels get back the distortion and the
+    rolling shutter of the image; depths are read again from the raw depth images.
 
     Raises:
         InputError: a keyframe's depth image is missing or broken.
     """
-    camera = sequence.camera
+    camera = reader.sequence.camera
     keyframe_ids, keyframes = np.unique(observations.keyframe_ids, return_inverse=True)
     landmark_ids, landmarks = np.unique(observations.landmark_ids, return_inverse=True)
     pixels = camera.distort(as_exposed(observations.measurements[:, :2], motion, camera))
     nominal = sensor_sigmas(observations, camera)
     depths = Depths.missing(len(observations))
     for k, keyframe in enumerate(keyframe_ids.tolist()):
-        rows, index = np.flatnonzero(keyframes == k), frames[keyframe]
-        depths.measure(rows, pixels[rows], sequence, index, MAX_STEP_SIGMAS * nominal[rows])
+        rows = np.flatnonzero(keyframes == k)
+        depths.put(rows, reader.measure(keyframe, pixels[rows], nominal[rows]))
     views = CalibrationViews(
         keyframes=keyframes,
         landmarks=landmarks,
@@ -166,16 +168,61 @@ class Depths:
             np.where(known, self.lag_s[rows], 0.0),
         )
 
-    def measure(
-        self, rows: Ints, pixels: Array, sequence: Sequence, index: int, max_step: Array
-    ) -> None:
-        """Measure at some pixels (m, 2) in the depth image of a frame; ``rows`` (m,) are theirs."""
+    def put(self, rows: Ints, measured: Depths) -> None:
+        """Set what was measured at some rows (m,)."""
+        self.inverse_depth[rows], self.rms[rows] = measured.inverse_depth, measured.rms
+        self.rate[rows], self.lag_s[rows] = measured.rate, measured.lag_s
+
+
+class DepthReader(Protocol):
+    """Raw depth images of keyframes, which the camera's offset and distortion have not changed."""
+
+    @property
+    def keyframe_ids(self) -> Ints:
+        """(K,) ascending, of the keyframes whose depth images are at hand."""
+
+    def measure(self, keyframe_id: int, pixels: Array, sigmas: Array) -> Depths:
+        """At pixels (m, 2) as exposed, whose inverse depths have these sigmas (m,) in 1/m.
+
+        Raises:
+            InputError: the depth image is missing or broken.
+        """
+
+
+class SequenceDepths:
+    """The depth images of keyframes in a sequence.
+
+    Args:
+        stamps_s: of each keyframe, by id; those that the sequence does not have are left out.
+    """
+
+    def __init__(self, stamps_s: dict[int, float], sequence: Sequence) -> None:
+        self.sequence = sequence
+        known = {k: s for k, s in stamps_s.items() if np.isfinite(s)}
+        at = nearest_indices(sequence.timestamps_s, np.array(list(known.values())))
+        near = np.abs(sequence.timestamps_s[at] - np.array(list(known.values()))) < MAX_LATE_S
+        pairs = zip(known, at.tolist(), near, strict=True)
+        self._frames = {k: index for k, index, ok in pairs if ok}
+
+    @property
+    def keyframe_ids(self) -> Ints:
+        """(K,) ascending."""
+        return np.array(sorted(self._frames), np.int64)
+
+    def measure(self, keyframe_id: int, pixels: Array, sigmas: Array) -> Depths:
+        """As `DepthReader.measure`."""
+        sequence, index = self.sequence, self._frames[keyframe_id]
         image = _raw_inverse_depth(sequence, index)
-        planes, self.rms[rows] = smooth_value(image, pixels, max_step)
-        self.inverse_depth[rows] = planes[:, 0]
         change, step_s = _change_around(sequence, index)
-        self.rate[rows] = mean_on_plane(change, image, pixels, planes, max_step) / step_s
-        self.lag_s[rows] = sequence.pairs.lags_s[index] - sequence.camera.depth_time_offset_s
+        lag_s = sequence.pairs.lags_s[index] - sequence.camera.depth_time_offset_s
+        return measured_at(pixels, image, change / step_s, lag_s, MAX_STEP_SIGMAS * sigmas)
+
+
+def measured_at(pixels: Array, image: Array, rate: Array, lag_s: float, max_step: Array) -> Depths:
+    """Measurements at pixels (m, 2) of an image (H, W) of inverse depth, and of its rate."""
+    planes, rms = smooth_value(image, pixels, max_step)
+    rates = mean_on_plane(rate, image, pixels, planes, max_step)
+    return Depths(planes[:, 0], rms, rates, np.full(len(rms), lag_s))
 
 
 def _raw_inverse_depth(sequence: Sequence, index: int) -> Array:

@@ -55,8 +55,8 @@ def add_live(commands: Commands) -> None:
     _add_source_arguments(parser)
     add_config_arguments(parser)
     add_camera_argument(parser)
-    text = "find readout time and depth delay while it runs; auto: use them (default: report)"
-    parser.add_argument("--calibrate", default="report", metavar="auto|off|report", help=text)
+    text = "find readout, depth delay and bend while it runs; auto, the default: use them"
+    parser.add_argument("--calibrate", default="auto", metavar="auto|off|report", help=text)
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
     parser.add_argument("--map", action="store_true", help="also a dense map, as by bmask-slam map")
     add_segmenter_arguments(parser, "light")

@@ -206,19 +206,14 @@ class StateSaved:
 
 
 @dataclass(frozen=True)
-class EstimateTimes:
-    """To the calibration: estimate from a saved state of the map.
-
-    Only keyframes from ``first_keyframe`` on are used: those before were tracked with another
-    camera.
-    """
+class EstimateCamera:
+    """To the calibration: estimate from a saved state of the map."""
 
     state: Path
-    first_keyframe: int
 
 
 @dataclass(frozen=True, eq=False)
-class TimesEstimated:
+class CameraEstimated:
     """From the calibration: what was found.
 
     Attributes:

@@ -42,10 +42,10 @@ class LiveOptions:
             ``bmask-slam map`` reads it.
         title: of the plot of the trajectory.
         dense: make a dense map as well; needs ``out``.
-        calibrate: whether readout time and depth delay are found while it runs: ``auto`` uses what
-            is found, ``report`` only says so, ``off``.
-        interpolates: whether the source gives depth at the colour image's time where the camera has
-            a delay, also one that is found; if not, a delay is not used.
+        calibrate: whether readout time, depth delay and bend of depth are found while it runs:
+            ``auto`` uses what is found, ``report`` only says so, ``off``.
+        interpolates: whether the source gives depth at the colour image's time and straightened,
+            also by a camera that is found; if not, only a readout time that is found is used.
     """
 
     out: Path | None = None
@@ -71,10 +71,10 @@ class LiveOptions:
 def start_calibration(
     camera: Camera, config: SystemConfig, options: LiveOptions
 ) -> RemoteCalibration:
-    """The process that estimates the camera's times."""
-    rules, adopt = SelfCalibrationConfig(), options.calibrate == "auto"
-    setup = CalibrationSetup(camera, config.graph, rules, options.interpolates)
-    return RemoteCalibration(setup, adopt)
+    """The process that estimates the camera."""
+    rules = SelfCalibrationConfig()
+    setup = CalibrationSetup(camera, config.graph, rules, options.calibrate, options.interpolates)
+    return RemoteCalibration(setup)
 
 
 def start_dense(

@@ -25,9 +25,9 @@ from bmask_slam.labelling.results import LandmarkLabels
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.live.messages import (
     STATE_FILE,
+    CameraEstimated,
     ChangeOwnFactors,
     ImageToSegment,
-    TimesEstimated,
     UseCamera,
 )
 from bmask_slam.live.processes.map_process import LabelsOnly
@@ -146,7 +146,7 @@ class LiveSystem(SlamSystem):
         made = result.keyframe_id
         return None if made is None else self.remote.world.keyframes.get(made)
 
-    def use_camera(self, found: TimesEstimated) -> None:
+    def use_camera(self, found: CameraEstimated) -> None:
         """Track with a camera of other times from the next frame on, and tell the map."""
         if found.camera is not None:
             self.camera = self.camera_tracker.tracker.camera = found.camera

@@ -14,18 +14,16 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
-import numpy as np
-
 from bmask_slam.calibration.adoption import (
     FREE,
     Estimate,
     SelfCalibration,
     SelfCalibrationConfig,
-    camera_with,
     format_found,
-    newly_sure,
+    judged,
 )
 from bmask_slam.calibration.rematching import estimate_again
+from bmask_slam.calibration.views import SequenceDepths
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.instances import Instance, PackedMask
@@ -38,7 +36,6 @@ from bmask_slam.system_interface import System
 logger = logging.getLogger(__name__)
 
 _Packed = tuple[list[tuple[Instance, PackedMask]], SurfaceClasses | None]
-UNOBSERVABLE = "readout, delay and bend of depth not observable in the motion"
 
 
 class RememberingSegmenter:
@@ -112,7 +109,7 @@ class SelfCalibrator:
         if estimate is None:
             self.state = replace(before, looks=before.looks + 1)
         else:
-            self.state = self._judged(estimate)
+            self.state = judged(before, estimate, self._mode, self._config)
         text = self.state.text
         if text != before.text:
             logger.info("calibration: %s", text)
@@ -131,31 +128,12 @@ class SelfCalibrator:
             return None
         world, worth_s = system.mapper.world, self._config.min_change_s
         try:
-            estimate = estimate_again(world, system.as_run(), sequence, worth_s)
+            stamps_s = {k.id: k.timestamp_s for k in world.keyframes.values()}
+            reader = SequenceDepths(stamps_s, sequence)
+            estimate = estimate_again(world, system.as_run(), reader, worth_s)
         except InputError as error:
             logger.info("calibration: %s", error)
             return None
         if estimate is not None:
             logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
         return estimate
-
-    def _judged(self, estimate: Estimate) -> SelfCalibration:
-        """The state after an estimate. What was adopted is not estimated again.
-
-        A parameter that does not show yet is looked for again later, unless one was adopted.
-        """
-        state, config = self.state, self._config
-        sure = newly_sure(estimate, FREE, config)
-        if sure:
-            verdict = "found and applied" if self._mode == "auto" else "found, not applied"
-            text = format_found(estimate, sure, verdict)
-            if self._mode != "auto":
-                return replace(state, text=text, settled=True)
-            camera = camera_with(state.given, estimate.found, sure)
-            return replace(state, camera=camera, text=text, settled=True)
-        seen = [i for i in FREE if estimate.shows(i, config)]
-        differs = any(estimate.differs(i, config) for i in FREE)
-        verdict = "not sure enough to be applied" if differs else "the camera keeps it"
-        text = format_found(estimate, seen, verdict) if seen else UNOBSERVABLE
-        settled = len(seen) == np.count_nonzero(estimate.sigmas[list(FREE)]) and not differs
-        return replace(state, text=text, looks=state.looks + 1, settled=settled)

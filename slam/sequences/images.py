@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Floats, Image
-from bmask_slam.graph.camera import Camera, depth_distortion_terms
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.image_files import decode_image, read_colour
 
@@ -67,17 +67,16 @@ def depth_in_metres(stored: NDArray, camera: Camera) -> Floats:
         depth_m += np.float32(camera.depth_offset_m)
     if any(camera.depth_distortion):
         with np.errstate(invalid="ignore", divide="ignore"):
-            depth_m /= 1 - depth_m * _depth_distortion(camera)
+            depth_m /= 1 - depth_m * _depth_bend(camera)
     depth_m[~((stored > 0) & (depth_m > 0) & (depth_m < np.inf))] = np.nan
     return depth_m
 
 
 @lru_cache(2)
-def _depth_distortion(camera: Camera) -> Floats:
+def _depth_bend(camera: Camera) -> Floats:
     """What the sensor adds to the inverse depth of each pixel (H, W), in 1/m."""
     v, u = np.mgrid[: camera.height, : camera.width]
-    terms = depth_distortion_terms(camera.image_places(np.stack([u, v], axis=-1)))
-    return (terms @ np.array(camera.depth_distortion)).astype(np.float32)
+    return camera.depth_bend(np.stack([u, v], axis=-1)).astype(np.float32)
 
 
 def depth_between(near_m: Floats, other_m: Floats, share: float) -> Floats:

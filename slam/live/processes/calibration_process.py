@@ -1,7 +1,7 @@
-"""The calibration's process: readout time and depth delay of the camera, from a state of the map.
+"""The calibration's process: what a state of the map shows of the camera.
 
-It decides as an offline run does (`calibration.adoption`), but a round is what was tracked since
-the camera was last changed, not the same frames again.
+It estimates and decides as an offline run does (`calibration.rematching`, `calibration.adoption`);
+frames that were tracked before stay as they are.
 """
 
 from __future__ import annotations
@@ -14,33 +14,27 @@ import numpy as np
 
 from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.calibration.adoption import (
-    TIMES,
-    CalibrationRounds,
+    FREE,
+    SelfCalibration,
     SelfCalibrationConfig,
-    estimate_times,
     format_found,
+    judged,
 )
-from bmask_slam.calibration.calibrate import MAX_KEYFRAMES
-from bmask_slam.calibration.keyframe_depth import (
-    DepthSamples,
-    KeyframeDepth,
-    KeyframeImages,
-    keyframe_problem,
-)
+from bmask_slam.calibration.keyframe_depth import KeptDepths, KeyframeDepth, KeyframeImages
 from bmask_slam.calibration.motion import twists_at
-from bmask_slam.calibration.views import connected_views, sensor_sigmas
+from bmask_slam.calibration.rematching import estimate_again
+from bmask_slam.calibration.views import sensor_sigmas
 from bmask_slam.graph.arrays import Array, Ints
-from bmask_slam.graph.calibration.model import SHUTTER, parameters_of
+from bmask_slam.graph.calibration.model import SHUTTER
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.files.array_file import part, read_arrays
 from bmask_slam.graph.marginals.landmark_marginalisation import reinsert
 from bmask_slam.graph.smoother.storage import factor_tables_of, read_camera
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.channel import Channel
-from bmask_slam.live.messages import STATE_FILE, EstimateTimes, Ready, TimesEstimated
+from bmask_slam.live.messages import STATE_FILE, CameraEstimated, EstimateCamera, Ready
 from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.map_state import world_of
@@ -48,7 +42,7 @@ from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 
-MAX_IMAGES = 120
+MAX_IMAGES = 80
 """Keyframes whose depth images are kept, 1.2 MB each at 640 x 480."""
 
 
@@ -60,13 +54,15 @@ class CalibrationSetup:
         camera: that the run begins with.
         graph: settings of the graph.
         config: when something is adopted.
-        interpolates: whether the source makes use of the camera's depth delay.
+        mode: "auto": what is sure is adopted; "report": it is only said.
+        follows: whether the source's depth follows a camera of another delay or distortion.
     """
 
     camera: Camera
     graph: SmootherConfig
     config: SelfCalibrationConfig
-    interpolates: bool
+    mode: str
+    follows: bool
 
 
 def serve_calibration(channel: Channel, setup: CalibrationSetup) -> None:
@@ -77,25 +73,17 @@ def serve_calibration(channel: Channel, setup: CalibrationSetup) -> None:
         match message:
             case KeyframeImages():
                 server.add(message)
-            case EstimateTimes():
+            case EstimateCamera():
                 channel.send(server.estimate(message))
 
 
 class CalibrationServer:
-    """Keeps depth images of keyframes, and estimates in rounds."""
+    """Keeps depth images of keyframes, and estimates until the camera is settled."""
 
     def __init__(self, setup: CalibrationSetup) -> None:
         self._setup = setup
         self._depths: dict[int, KeyframeDepth] = {}
-        self._rounds = self._new_rounds()
-        self._begun = False
-        self._given = parameters_of(setup.camera, setup.camera.depth_scale)
-
-    def _new_rounds(self) -> CalibrationRounds:
-        free = set(TIMES if self._setup.interpolates else (SHUTTER,))
-        if self._setup.camera.rolling_shutter_s:  # the sensor's, as for a run that is not live
-            free.discard(SHUTTER)
-        return CalibrationRounds(self._setup.camera, self._setup.config, tuple(free))
+        self._state = SelfCalibration(setup.camera, setup.camera)
 
     def add(self, images: KeyframeImages) -> None:
         """Keep what is needed of a keyframe's depth images."""
@@ -103,49 +91,28 @@ class CalibrationServer:
         if len(self._depths) > MAX_IMAGES:
             del self._depths[min(self._depths)]
 
-    def estimate(self, message: EstimateTimes) -> TimesEstimated:
-        """What the keyframes since the last change of the camera say of it."""
-        run, world, paths = read_state(message.state, self._setup.graph)
-        chosen = [k for k in self._depths if k >= message.first_keyframe and k in world.keyframes]
-        seen = connected_views(run.tables, np.array(sorted(chosen), np.int64), MAX_KEYFRAMES)
+    def estimate(self, message: EstimateCamera) -> CameraEstimated:
+        """What the keyframes say of the camera."""
+        setup, config = self._setup, self._setup.config
+        run, world, paths = read_state(message.state, setup.graph)
+        kept = {k: depth for k, depth in self._depths.items() if k in world.keyframes}
+        state = replace(self._state, looks=self._state.looks + 1)
         try:
-            seen, samples = self._sampled(seen, world, run.camera)
-            estimate = estimate_times(keyframe_problem(run, seen, samples))
+            reader = KeptDepths(kept, run.camera)
+            estimate = estimate_again(world, run, reader, config.min_change_s)
         except InputError as error:
             logger.info("calibration: %s", error)
-            return TimesEstimated(None, {}, "", False)
-        text = format_found(estimate, TIMES, "estimated")
-        logger.info("calibration: %d keyframes: %s", len(np.unique(seen.keyframe_ids)), text)
-        if not self._begun and not self._rounds.shows(estimate):
-            return TimesEstimated(None, {}, "not observable in the motion so far", False)
-        camera = self._rounds.add(estimate)
-        result, done = self._rounds.result(), camera is None
-        used = [i for i in TIMES if estimate.before[i] != self._given[i]]
-        if self._begun and done and result.adopted and estimate.settled(used):
-            return TimesEstimated(None, {}, "", True)  # what is in use was found again
-        if camera is None and not self._begun:
-            self._rounds = self._new_rounds()
-            differs = any(estimate.differs(i, self._setup.config) for i in TIMES)
-            return TimesEstimated(None, {}, result.text, done=not differs)
-        self._begun = True
-        camera = camera or result.camera
-        return TimesEstimated(camera, self._motions(world, paths, run, camera), result.text, done)
-
-    def _sampled(
-        self, seen: Observations, world: WorldMap, camera: Camera
-    ) -> tuple[Observations, DepthSamples]:
-        """The observations whose keypoints are known, and their samples of the depth images."""
-        if not len(seen):
-            raise InputError("no keyframes share landmarks, too few to calibrate")
-        sigmas, parts, rows = sensor_sigmas(seen, camera), [], []
-        for k in np.unique(seen.keyframe_ids).tolist():
-            of_keyframe = np.flatnonzero(seen.keyframe_ids == k)
-            known, keypoints = observed_by(world, k, seen.landmark_ids[of_keyframe])
-            rows.append(of_keyframe[known])
-            parts.append(self._depths[k].sample(keypoints, sigmas[rows[-1]]))
-        names = ("pixels", "inverse_depth", "rms", "rate", "lag_s", "sigmas")
-        columns = [np.concatenate([getattr(p, name) for p in parts]) for name in names]
-        return seen.select(np.concatenate(rows)), DepthSamples(*columns)
+            estimate = None
+        if estimate is not None:
+            logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
+            free = FREE if setup.follows else (SHUTTER,)
+            state = judged(self._state, estimate, setup.mode, config, free)
+        self._state = state
+        if state.adopted:
+            motions = self._motions(world, paths, run, state.camera)
+            return CameraEstimated(state.camera, motions, state.text, True)
+        done = state.settled or state.looks >= config.stretches
+        return CameraEstimated(None, {}, state.text, done)
 
     def _motions(
         self, world: WorldMap, paths: dict[int, Trajectory], run: SavedRun, camera: Camera
@@ -163,10 +130,9 @@ class CalibrationServer:
             if not len(seen):
                 continue
             known, keypoints = observed_by(world, k.id, seen.landmark_ids)
-            samples = depth.sample(keypoints, sensor_sigmas(seen, camera)[known])
-            change = samples.delay_correction(camera.depth_time_offset_s)
+            sigmas = sensor_sigmas(seen, camera)[known]
+            change = depth.delay_correction(keypoints, sigmas, camera.depth_time_offset_s)
             motions[k.id] = KeyframeMotion(twist, keypoints, change)
-            self._depths[k.id] = replace(depth, lag_s=-camera.depth_time_offset_s)
         return motions
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from bmask_slam.calibration.keyframe_depth import DepthImage, KeyframeImages
 from bmask_slam.graph.arrays import Array
-from bmask_slam.live.messages import EstimateTimes, TimesEstimated
+from bmask_slam.live.messages import CameraEstimated, EstimateCamera
 from bmask_slam.live.processes.calibration_process import CalibrationSetup
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.worker import Failure, Worker
@@ -46,17 +46,15 @@ class RemoteCalibration:
         text: the last of what was found, in one line; "" before.
     """
 
-    def __init__(self, setup: CalibrationSetup, adopt: bool = True) -> None:
-        """Start the process; with ``adopt`` False nothing that it finds is used."""
+    def __init__(self, setup: CalibrationSetup) -> None:
+        """Start the process."""
         self.done = self.busy = False
         self.text = ""
-        self._frames_each = setup.config.frames
-        self._tries_left = setup.config.stretches
-        self.adopts = adopt
+        self._due = setup.config.frames
+        self.adopts = setup.mode == "auto"
         self._worker = Worker("calibration", TARGET, setup)
         os.setpriority(os.PRIO_PROCESS, self._worker.pid, NICENESS)  # from its start on
-        self._frames = 0  # since the camera was changed, or since the last estimate
-        self._first_keyframe = 0
+        self._frames = 0
         self._awaited_save: int | None = None
         self._last: list[DepthImage] = []
         self._pending: _Pending | None = None
@@ -83,21 +81,22 @@ class RemoteCalibration:
             pixels = keyframe.features.image_pixels
             self._pending = _Pending(keyframe.id, pixels, frame.depth_lag_s)
 
-    def update(self, mapper: RemoteMapper) -> TimesEstimated | None:
+    def update(self, mapper: RemoteMapper) -> CameraEstimated | None:
         """Ask for an estimate when it is due; returns one that has come."""
         if self.done:
             return None
         saves, state = mapper.saved
-        if not self.busy and self._frames >= self._frames_each:
+        if not self.busy and self._frames >= self._due:
             self.busy, self._awaited_save = True, saves + 1
+            self._due *= 2
             mapper.save_state()
         if self._awaited_save is not None and saves >= self._awaited_save and state is not None:
             self._awaited_save = None
-            self._worker.send(EstimateTimes(state, self._first_keyframe))
+            self._worker.send(EstimateCamera(state))
         for message in self._worker.receive():
             match message:
-                case TimesEstimated():
-                    return self._answered(message, mapper)
+                case CameraEstimated():
+                    return self._answered(message)
                 case Failure():
                     logger.error("the calibration failed: %s", message.text)
         if not self._worker.is_running:
@@ -114,17 +113,9 @@ class RemoteCalibration:
         """Kill the process."""
         self._worker.kill()
 
-    def _answered(self, found: TimesEstimated, mapper: RemoteMapper) -> TimesEstimated:
-        self.busy, self._frames = False, 0
-        if found.camera is not None and not self.adopts:
-            text = found.text.replace("found and applied", "found, not applied")
-            found = TimesEstimated(None, {}, text, True)
-        self.text = found.text or self.text
+    def _answered(self, found: CameraEstimated) -> CameraEstimated:
+        self.busy, self.text = False, found.text or self.text
         logger.info("calibration: %s", found.text or "nothing new")
-        if found.camera is not None:
-            self._first_keyframe = mapper.world.next_keyframe_id
-        else:
-            self._tries_left -= 1
-        if found.done or not self._tries_left:
+        if found.done:
             self.end()
         return found

@@ -73,7 +73,7 @@ class Source(Protocol):
 
     @property
     def use(self) -> Callable[[Camera], None] | None:
-        """Gives later frames their depth by another ``depth_time_offset_s``, from any thread.
+        """Gives later frames their depth by another camera, from any thread.
 
         None where depth is not interpolated at the colour image's time.
         """

@@ -75,3 +75,15 @@ def test_inverse_depth_changes_by_what_the_delay_did_and_no_more_than_is_possibl
     np.testing.assert_allclose(1 / after_m[:2], 1 / before_m[:2] + change[:2])
     np.testing.assert_array_equal(after_m[2:], before_m[2:])
     assert before_m[0] == pytest.approx(after_m[0] * 1.01)
+
+
+def test_a_bend_of_depth_that_is_found_later_is_taken_out_at_each_keypoint() -> None:
+    keyframe, _ = exposed_keyframe()
+    before_m, pixels = keyframe.features.depth_m.copy(), keyframe.features.image_pixels
+    bent = replace(CAMERA, depth_distortion=(0.004, -0.006, 0.010, 0.014, -0.005))
+    reinterpret(keyframe, KeyframeMotion(TWIST), CAMERA, bent)
+    bend = 1 / before_m - 1 / keyframe.features.depth_m
+    np.testing.assert_allclose(bend, bent.depth_bend(pixels), atol=1e-9)
+    assert np.ptp(bend) > 5e-3
+    reinterpret(keyframe, KeyframeMotion(TWIST), bent, CAMERA)
+    np.testing.assert_allclose(keyframe.features.depth_m, before_m)

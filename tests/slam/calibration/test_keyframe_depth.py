@@ -7,7 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bmask_slam.calibration.keyframe_depth import DepthImage, KeyframeDepth, KeyframeImages
+from bmask_slam.calibration.keyframe_depth import (
+    DepthImage,
+    KeptDepths,
+    KeyframeDepth,
+    KeyframeImages,
+)
+from bmask_slam.graph.camera import Camera
+from bmask_slam.sequences.images import depth_in_metres
 
 SPEED = 0.4  # m/s, a wall that goes away
 STEP_S, LAG_S, OFFSET_S = 1 / 30, 0.004, -0.015
@@ -28,10 +35,11 @@ def images(colour_s: float = 10.0) -> KeyframeImages:
 
 
 def test_the_depth_at_the_colour_images_time_is_found_by_the_rate() -> None:
-    samples = KeyframeDepth.of(images()).sample(np.arange(3), np.full(3, 0.002))
+    depth, sigmas = KeyframeDepth.of(images()), np.full(3, 0.002)
+    samples = depth.sample(PIXELS, sigmas)
     inverse = 0.5 + 2e-4 * PIXELS[:, 0]
     np.testing.assert_allclose(samples.rate, -SPEED * inverse**2, rtol=0.03)
-    corrected = samples.inverse_depth + samples.delay_correction(OFFSET_S)
+    corrected = samples.inverse_depth + depth.delay_correction(np.arange(3), sigmas, OFFSET_S)
     np.testing.assert_allclose(corrected, inverse, atol=3e-4)
     assert np.abs(samples.inverse_depth - inverse).min() > 8e-4
 
@@ -42,6 +50,27 @@ def test_an_unknown_rate_corrects_nothing(fault: str) -> None:
     later = replace(given.after, depth_m=given.after.depth_m + 1)  # another surface
     if fault == "time":
         later = replace(given.after, stamp_s=given.after.stamp_s + 1)
-    samples = KeyframeDepth.of(replace(given, after=later)).sample(np.arange(3), np.full(3, 0.002))
+    depth, sigmas = KeyframeDepth.of(replace(given, after=later)), np.full(3, 0.002)
+    samples = depth.sample(PIXELS, sigmas)
     assert np.isnan(samples.rate).all() and np.isfinite(samples.inverse_depth).all()
-    assert not samples.delay_correction(OFFSET_S).any()
+    assert not depth.delay_correction(np.arange(3), sigmas, OFFSET_S).any()
+
+
+def test_kept_depths_are_the_raw_ones() -> None:
+    """What the camera's offset and distortion did to depth and its rate is undone."""
+    bend = (0.004, -0.006, 0.010, 0.014, -0.005)
+    camera = Camera(320, 240, 260.0, 260.0, 160.0, 120.0, depth_scale=1.0)
+    bent = replace(camera, depth_offset_m=0.03, depth_distortion=bend)
+    raw = images()
+    corrected = (
+        DepthImage(depth_in_metres(image.depth_m, bent), image.stamp_s)
+        for image in (raw.depth, raw.before, raw.after)
+    )
+    kept = KeyframeDepth.of(KeyframeImages(3, PIXELS, *corrected, LAG_S))
+    sigmas = np.full(3, 0.002)
+    found = KeptDepths({3: kept}, bent).measure(3, PIXELS, sigmas)
+    truth = KeyframeDepth.of(raw).sample(PIXELS, sigmas)
+    assert np.abs(kept.sample(PIXELS, sigmas).inverse_depth - truth.inverse_depth).min() > 5e-3
+    np.testing.assert_allclose(found.inverse_depth, truth.inverse_depth, atol=2e-4)
+    np.testing.assert_allclose(found.rate, truth.rate, rtol=5e-3)
+    assert (found.lag_s == LAG_S).all()

@@ -20,7 +20,6 @@ from bmask_slam.calibration.adoption import (
     SelfCalibrationConfig,
     camera_with,
     format_found,
-    next_start,
 )
 from bmask_slam.calibration.priors import estimated_priors
 from bmask_slam.calibration.report import parameters_named
@@ -309,24 +308,6 @@ def test_a_found_camera_is_adopted() -> None:
     assert not SelfCalibration(camera, camera).adopted
     other = dataclasses.replace(camera, rolling_shutter_s=0.02)
     assert SelfCalibration(camera, other).adopted
-
-
-def test_two_rounds_are_extrapolated() -> None:
-    """A run with a camera error d finds a camera with a fraction of d as error."""
-    truth, share = 0.026, 0.4
-
-    def estimate(start: float) -> Estimate:
-        before, found = np.zeros(18), np.zeros(18)
-        before[SHUTTER], found[SHUTTER] = start, truth + share * (start - truth)
-        return Estimate(before, found, np.full(18, 1e-4), None)  # type: ignore[arg-type]
-
-    first = estimate(0.0)
-    second = estimate(next_start([first])[SHUTTER])
-    assert second.before[SHUTTER] == first.found[SHUTTER]
-    third = next_start([first, second])
-    assert third[SHUTTER] == pytest.approx(truth, abs=1e-9)
-    assert third[TIME] == 0.0
-    assert estimate(third[SHUTTER]).settled([SHUTTER]) and not second.settled([SHUTTER])
 
 
 def test_a_run_that_begins_anew_frees_the_system_of_before(

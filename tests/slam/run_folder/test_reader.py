@@ -28,7 +28,7 @@ def labelled(slow_office: Path, tmp_path_factory: pytest.TempPathFactory) -> Run
     folder = tmp_path_factory.mktemp("reader")
     settings = {"covariances": True, "semantics.segmenter.min_score": 0.5}
     found = run(slow_office, folder / "run", segmenter="truth", settings=settings, max_frames=16)
-    return map_run(found)
+    return map_run(found, voxel_m=0.02)
 
 
 @pytest.fixture
