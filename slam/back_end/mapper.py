@@ -53,9 +53,8 @@ class Mapper:
 
     Attributes:
         world: keyframes and landmarks. history: of all tracked frames. smoother: the graph.
-        loops: finds loops, and holds closed ones.
+        loops: finds loops, and holds closed ones. events: of this system.
         sensors: makes factors of the measurements of other sensors.
-        events: of this system.
         update_ms: wall time of every graph update.
     """
 
