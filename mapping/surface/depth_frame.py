@@ -31,8 +31,9 @@ DARKEST, BRIGHTEST = 16.0, 240.0
 MIN_PIXELS, MAX_GAIN = 100, 2.5
 PULL = 0.95
 """Share of a difference that is made up for: else errors of the gains would add up on the way."""
-UNEXPLAINED = 0.25
-"""How much a frame counts as a witness of a surface that the keyframes did not see."""
+UNEXPLAINED = 0.0875
+"""How much a frame counts as a witness of a surface that the keyframes did not see: twelve are
+needed for one."""
 NX, NY, NZ, OFFSET, WEIGHT, Z, BEHIND, WITNESS = range(8)
 """Columns of ``DepthFrame.pixels``."""
 

@@ -20,8 +20,11 @@ from bmask_slam.mapping.surface.volume import COLOUR_VOXELS, SurfaceVolume
 CORNERS = np.array(list(product((0, 1), repeat=3)))
 EDGES = [(a, b) for a, b in combinations(range(8), 2) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1]
 AT_ONCE = 1000
-MIN_WITNESSES, MAX_FREE_SHARE = 3.0, 0.5
+MIN_WITNESSES, MAX_FREE_SHARE = 1.0, 0.5
 """A surface needs so many frames that saw it, and at most this share of them saw through it."""
+MAX_STEP_VOXELS = 3.0
+"""Distances in a cell differ by less: else it is not a surface that a frame saw, but the limit
+between what is behind one and what another frame saw as free beside it."""
 MIN_COMPONENT_M2 = 0.02
 
 
@@ -167,8 +170,9 @@ def _voxels(table: Tensor, blocks: Ints) -> NDArray[np.float32]:
 
 
 def _vertices(cells: _Cells, voxel_m: float) -> tuple[NDArray, ...]:
-    """Points, colours, weights and views of the cells in which the distance changes its sign, their
-    keys (N,), and along which axes (N, 3) it does: 1 from outside to inside, -1 back, 0 not at all.
+    """Points, colours, weights and views of the cells in which the distance changes its sign
+    without a step, their keys (N,), and along which axes (N, 3) it does: 1 from outside to inside,
+    -1 back, 0 not at all.
 
     A vertex is the mean of the points where the edges of its cell are crossed.
     """
@@ -177,7 +181,8 @@ def _vertices(cells: _Cells, voxel_m: float) -> tuple[NDArray, ...]:
     for value in window[1:]:
         np.minimum(low, value, out=low)  # NaN stays NaN
         np.maximum(high, value, out=high)
-    block, *local = np.nonzero((low < 0) & (high >= 0))
+    crossed = (low < 0) & (high >= 0) & (high - low < MAX_STEP_VOXELS * voxel_m)
+    block, *local = np.nonzero(crossed)
     at = [(block, *(a + c for a, c in zip(local, corner, strict=True))) for corner in CORNERS]
     d: Array = np.stack([cells.distance[a] for a in at], axis=1).astype(float)
     place = _mean_crossing(d)

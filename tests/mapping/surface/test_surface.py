@@ -16,7 +16,7 @@ from bmask_slam.mapping.open3d_loader import load_open3d
 from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.mesh_files import write_glb, write_mesh
 from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame, mark_unexplained
-from bmask_slam.mapping.surface.extraction import Surface, extract, without_crumbs
+from bmask_slam.mapping.surface.extraction import MIN_WITNESSES, Surface, extract, without_crumbs
 from bmask_slam.mapping.surface.gate import KeyframeSurface, judge_of
 from bmask_slam.mapping.surface.volume import SurfaceVolume
 
@@ -34,7 +34,7 @@ def plane(T: Array, colour: int = 200) -> DepthFrame:
     return frame(plane_rho(T, NORMAL, OFFSET_M), T, colour)
 
 
-def surface_of(frames: list[DepthFrame], min_witnesses: float = 3) -> Surface:
+def surface_of(frames: list[DepthFrame], min_witnesses: float = MIN_WITNESSES) -> Surface:
     volume = SurfaceVolume(VOXEL_M, CAMERA, blocks=4)
     for given in frames:
         volume.integrate(given)
@@ -145,6 +145,18 @@ def test_what_keyframes_did_not_see_needs_more_witnesses() -> None:
 
     assert seen(11) == 0
     assert seen(12) > 300
+
+
+def test_the_limit_between_behind_and_free_is_no_surface() -> None:
+    """As where other frames look past the rim of a plate: what is at the rim, none has seen."""
+    volume = SurfaceVolume(VOXEL_M, CAMERA)
+    volume.integrate(frame(np.full((30, 40), 0.5), np.eye(4)))
+    bricks = (volume._origin[: len(volume), None] + volume._bricks).reshape(-1, 1, 3)
+    beside = (bricks + volume._voxels)[..., 0] > 0.01
+    volume.distance[: len(beside)][beside] = 8 * VOXEL_M
+    found = extract(volume).vertices
+    assert len(found) > 100
+    assert np.abs(found[:, 2] - 2.0).max() < 0.5 * VOXEL_M
 
 
 def test_a_thin_wall_has_two_sides() -> None:
