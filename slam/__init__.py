@@ -10,7 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from bmask_slam.api import make_segmenter, map_run, run
+    from bmask_slam.api import make_segmenter, map_run, merge_runs, run
     from bmask_slam.evaluation import evaluate
     from bmask_slam.events import Event, EventKind
     from bmask_slam.graph.camera import Camera
@@ -47,6 +47,7 @@ __all__ = [
     "key_of_landmark",
     "make_segmenter",
     "map_run",
+    "merge_runs",
     "open_sequence",
     "run",
 ]
@@ -70,6 +71,7 @@ _MODULES = {
     "key_of_landmark": "graph.factors.keys",
     "make_segmenter": "api",
     "map_run": "api",
+    "merge_runs": "api",
     "open_sequence": "sequences",
     "run": "api",
 }

@@ -129,6 +129,23 @@ def map_run(
     return Run(run)
 
 
+def merge_runs(*runs: AnyPath, out: AnyPath, overwrite: bool = False) -> Run:
+    """Make one run of finished ones, as ``bmask-slam merge`` does, and return its run folder.
+
+    Args:
+        runs: run folders or `Run`, two or more; the world frame is that of the first.
+        out: the run folder. overwrite: replace the run that it holds.
+
+    Raises:
+        InputError: runs that are not finished or do not fit together, a run that has no place in
+            common with the others, or one that only looks alike.
+    """
+    from bmask_slam.merging import merge  # noqa: PLC0415 - loads GTSAM
+
+    folders = tuple(Path(run) for run in runs)
+    return Run(merge.merge_runs(merge.MergeOptions(folders, Path(out), overwrite)).folder)
+
+
 def make_segmenter(
     segmenter: str | SegmenterOptions = "light", sequence: AnyPath = ""
 ) -> Segmenter:

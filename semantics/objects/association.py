@@ -10,6 +10,8 @@ from scipy.spatial import KDTree
 from bmask_slam.graph.arrays import Array, Ints, Mask
 
 _IMPOSSIBLE = 1e6
+JOINED_DEPTH_M = 2.0
+"""From about so far the objects of different maps were seen."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,20 @@ class Overlap:
     of_object: Array
     in_view: Ints
 
+    @classmethod
+    def of_points(
+        cls, detected: tuple[Array, Ints], known: tuple[Array, Ints], config: AssociationConfig
+    ) -> Overlap:
+        """Of points (N, 3) in one frame, all in view, each with its detection or object."""
+        sizes = [np.bincount(numbers) for _, numbers in (detected, known)]
+        reach_m, found = float(config.reach_m(np.array(JOINED_DEPTH_M))), []
+        for a, b in ((0, 1), (1, 0)):
+            (points, numbers), (others, owners) = (detected, known)[a], (detected, known)[b]
+            hit = points_on_objects(points, others, owners, np.full(len(points), reach_m))
+            on, shape = hit >= 0, (len(sizes[a]), len(sizes[b]))
+            found.append(shares(numbers[on], hit[on], sizes[a], shape))
+        return cls(found[0], found[1].T, sizes[1])
+
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
@@ -74,17 +90,14 @@ def shares(first: Ints, second: Ints, sizes: Ints, shape: tuple[int, int]) -> Ar
     return counts / np.maximum(sizes, 1)[:, None]
 
 
-def points_on_objects(
-    points: Array, object_points: Array, owners: Ints, config: AssociationConfig
-) -> Ints:
-    """The object (P,) that is nearest to each point (P, 3), -1 for none.
+def points_on_objects(points: Array, object_points: Array, owners: Ints, reach_m: Array) -> Ints:
+    """The object (P,) within reach (P,) that is nearest to each point (P, 3), -1 for none.
 
-    ``object_points`` (N, 3) belong to objects ``owners`` (N,); all points in the camera's frame.
+    ``object_points`` (N, 3) belong to objects ``owners`` (N,); all points in one frame.
     """
     found = np.full(len(points), -1)
     if not len(object_points) or not len(points):
         return found
-    reach_m = config.reach_m(points[:, 2])
     distance_m, nearest = KDTree(object_points).query(
         points, distance_upper_bound=float(reach_m.max())
     )

@@ -148,7 +148,8 @@ class ObjectMap:
         inside, pixels = self._inside(all_points)
         owners, points = all_owners[inside], all_points[inside]
         ids, columns = np.unique(owners, return_inverse=True)
-        hit = points_on_objects(found.points_camera, points, columns, config)
+        reach_m = config.reach_m(found.points_camera[:, 2])
+        hit = points_on_objects(found.points_camera, points, columns, reach_m)
         sizes = np.bincount(found.owners, minlength=len(found))
         on = hit >= 0
         of_detection = shares(found.owners[on], hit[on], sizes, (len(found), len(ids)))
@@ -241,6 +242,25 @@ class ObjectMap:
         self.labels.move(np.array([removed]), np.array([kept]))
         for evidence in (self._merging, self._splitting):
             evidence.drop(removed)
+
+    def join(self, poses: dict[int, Array], first: int, end: int) -> int:
+        """Merge objects of ids from ``first`` to ``end`` into older ones that are where they are.
+
+        As detections are assigned to objects, those of another map are to those of this one.
+        ``poses`` are of all keyframes, by id. Returns how many were merged.
+        """
+        owners, points = self.points.in_world(poses)
+        old, new = owners < first, (owners >= first) & (owners < end)
+        (ids, columns), (others, rows) = (
+            np.unique(owners[k], return_inverse=True) for k in (old, new)
+        )
+        config = self.config.association
+        overlap = Overlap.of_points((points[new], rows), (points[old], columns), config)
+        evidence = Evidence(self._known(others), self._known(ids), np.zeros(len(ids)))
+        same = assign(overlap, evidence, config)
+        for other, kept in zip(others[same >= 0], ids[same[same >= 0]], strict=True):
+            self.merge(int(kept), int(other))
+        return int((same >= 0).sum())
 
     def _split(
         self, split: int, o: int, matched: _Association, found: Detections, objects: Ints

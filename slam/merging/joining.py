@@ -117,6 +117,17 @@ def join(system: SlamSystem, tree: Sequence[Step], others: Sequence[CommonPlaces
     return Joined([k.ends for k in kept], found - len(kept), fused, _residuals(system, kept))
 
 
+def join_objects(system: SlamSystem, begins: Sequence[int]) -> int:
+    """Make the objects that several runs saw one each; the ids of run k begin at ``begins[k]``.
+
+    Returns how many were there twice.
+    """
+    system.semantics.follow_map()
+    poses = {k.id: k.T_world_camera for k in system.map.world.keyframes.values()}
+    objects, ends = system.semantics.objects, (*begins[2:], np.iinfo(np.int64).max)
+    return sum(objects.join(poses, a, b) for a, b in zip(begins[1:], ends, strict=True))
+
+
 def _move(world: WorldMap, tree: Sequence[Step]) -> None:
     """Move the segments of a tree, each into the world frame of what is joined already."""
     now = {k.segment: k.segment for k in world.keyframes.values()}

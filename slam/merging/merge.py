@@ -18,14 +18,14 @@ from bmask_slam.evaluation import Row
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.merging.common_places import CommonPlaces, MergeConfig, PlaceSearch
-from bmask_slam.merging.joining import Step, join
+from bmask_slam.merging.joining import Step, join, join_objects
 from bmask_slam.merging.joint_state import joint_state
 from bmask_slam.merging.report import MergeSummary, PairSearch, line_of, no_place, rows_of
 from bmask_slam.merging.sources import Source, read_sources
 from bmask_slam.run_folder.folder import RunFolder
 from bmask_slam.run_folder.frame_file import FRAMES
 from bmask_slam.run_folder.map_file import MAP
-from bmask_slam.run_folder.metrics import save
+from bmask_slam.run_folder.metrics import row, save
 from bmask_slam.run_folder.origin import Origin
 from bmask_slam.sequences.formats.joined import JOINED, write_parts
 from bmask_slam.system import SlamSystem
@@ -75,7 +75,9 @@ def merge_runs(options: MergeOptions) -> MergeSummary:
         tree, others = _plan(system, sources, found, options.config)
         joined = join(system, tree, others)
         folder.write_events(system.events.take())
+        twice = join_objects(system, [source.shift.objects for source in sources])
         rows = rows_of(system, sources, found, joined)
+        rows.append(row("merge_objects_fused", twice, "objects"))
         _write(folder, system, sources, rows)
         folder.complete()
         return MergeSummary(folder.path, rows, lines)

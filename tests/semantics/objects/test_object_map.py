@@ -272,3 +272,26 @@ def test_the_assignment_is_optimal_within_the_gate() -> None:
     other = Evidence(p, np.roll(p[:2], 1, axis=1), np.zeros(2))
     strict = AssociationConfig(max_cost=0.3)
     assert assign(overlap, other, strict).tolist() == [-1, -1, -1]
+
+
+def test_objects_of_another_map_become_those_that_are_where_they_are() -> None:
+    scene = Scene()
+    for x in (0.0, 0.05):
+        scene.show(x, CHAIRS)
+    points = scene.map.points
+    owners, places = points.in_world(scene.poses)
+    left, right = (places[owners == k] for k in (0, 1))
+    other = points.new_ids(3)  # seen by a keyframe that is where the world is
+    aside, below = np.array([0.01, 0.0, 0.0]), np.array([0.0, 0.9, 0.0])
+    moved = [right + aside, left - aside, left + below]
+    scene.poses[9] = np.eye(4)
+    of = np.repeat(other, [len(p) for p in moved])
+    points.add(Sightings(9, 9.0, other), np.concatenate(moved), of)
+    points.place_landmarks(np.array([7, 8]), other[[0, 2]])
+    assert scene.map.join(scene.poses, 2, 5) == 2
+    owners, _ = points.in_world(scene.poses)
+    assert np.unique(owners).tolist() == [0, 1, 4]
+    assert np.count_nonzero(owners == 1) == 2 * len(right)
+    assert points.landmarks_of(1).tolist() == [7]
+    assert points.landmarks_of(4).tolist() == [8]
+    assert scene.map.join(scene.poses, 4, 5) == 0
