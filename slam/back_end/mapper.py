@@ -138,7 +138,6 @@ class Mapper:
         self._factor_selector.remove_landmarks(cull_landmarks(world, local_ids, self._mapping))
         self.loops.add(keyframe)
         world.release_memory()
-        self.history.release_memory()
         return keyframe
 
     def optimise(self, keyframe: Keyframe) -> None:

@@ -83,19 +83,21 @@ class FrameHistory:
 
     def trajectories(self, world: WorldMap) -> dict[int, Trajectory]:
         """Every tracked frame whose keyframe was not lost, by map segment, from current poses."""
-        return {segment: path for segment, _, _, path in self._segments(world)}
+        found = {segment: path for segment, _, _, path in self._segments(world)}
+        self._entries.release()
+        return found
 
     def smooth(self, world: WorldMap) -> None:
         """Give the frames the poses that the camera's inertia makes the most probable."""
         for _, rows, origins, measured in self._segments(world):
             found = smooth(measured, self._store["information"][rows])
-            entries = self._store[rows]
-            entries["T_keyframe_camera"] = inverse(origins) @ found.poses_world_camera
-            self._entries.write(rows, entries)
+            self._place(rows, inverse(origins) @ found.poses_world_camera)
 
-    def release_memory(self) -> None:
-        """Give back the memory of what was read from the disk."""
-        self._entries.release()
+    def _place(self, rows: Ints, T_keyframe_camera: Array) -> None:
+        """Give rows (N,) other poses (N, 4, 4)."""
+        entries = self._store[rows]
+        entries["T_keyframe_camera"] = T_keyframe_camera
+        self._entries.write(rows, entries)
 
     @property
     def _store(self) -> Entries:
@@ -107,7 +109,7 @@ class FrameHistory:
             at = nearest_indices(path.timestamps_s, measured.timestamps_s)
             same = np.flatnonzero(path.timestamps_s[at] == measured.timestamps_s)
             found = path.poses_world_camera[at[same]]
-            self._store["T_keyframe_camera"][rows[same]] = inverse(origins[same]) @ found
+            self._place(rows[same], inverse(origins[same]) @ found)
 
     def _segments(self, world: WorldMap) -> Iterator[tuple[int, Ints, Array, Trajectory]]:
         """Each map segment: its number, rows (N,) of its entries, what these are relative to,

@@ -255,7 +255,6 @@ class RemoteMapper:
             return
         self.update_ms.append(message.update_ms)
         self.world.release_memory()
-        self.history.release_memory()
         self._pending -= set(message.delta.keyframe_ids.tolist()) | {message.keyframe_id}
         if message.keyframe_id + 1 - self._saved_keyframes >= SAVE_EVERY:
             self._saved_keyframes = message.keyframe_id + 1

@@ -14,6 +14,7 @@ from synthetic_view import CAMERA, render_plane, sideways_path
 
 from bmask_slam import cli
 from bmask_slam.config.configuration import dump
+from bmask_slam.evaluation import plot
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.graph.trajectory import read_tum
@@ -44,7 +45,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a run of each walk; the frames of each begin at stamp 0."""
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(metrics, "plot_trajectory", lambda path, *_: path.write_text("quick"))
+        patch.setattr(plot, "plot_trajectory", lambda path, *_: path.write_text("quick"))
         for name, poses in WALKS.items():
             system = SlamSystem(CAMERA, SystemConfig(keyframes=OFTEN))
             with RunFolder(folder / name) as run:
@@ -59,7 +60,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def merged(runs: Path) -> MergeSummary:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(metrics, "plot_trajectory", lambda path, *_: path.write_text("quick"))
+        patch.setattr(plot, "plot_trajectory", lambda path, *_: path.write_text("quick"))
         return merge_runs(MergeOptions((runs / "first", runs / "second"), runs / "merged"))
 
 
