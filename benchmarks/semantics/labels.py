@@ -135,7 +135,8 @@ def run_system(sequence: Sequence, arguments: argparse.Namespace) -> SlamSystem:
         segmenter = ImperfectSegmenter(segmenter, Errors(), arguments.seed)
     system = SlamSystem(sequence.camera, config, segmenter)
     classes = len(segmenter.labels)
-    system.semantics.labels = RecordingStore(classes, config.semantics.labels)
+    store = RecordingStore(classes, config.semantics.labels)
+    system.semantics.labels = system.semantics._label_votes._labels = store
     for frame in sequence.frames():
         system.process(frame)
     system.finish()

@@ -16,7 +16,8 @@ the mean logit of the class score, of the evidence, which is the sum of mask sco
 of its logarithm, with an offset for each class. Evidence does not count for what things lie on
 (tables, beds): these are there in every view. Corners within 5 px of the mask's edge do not
 count: of those depth and other views decide. Corners: of those under masks that are right, the
-share that is on the class, of all and of those 20 px or more inside. Objects: the same of whole
+share that is on the class, of all and of those 20 px or more inside, by the evidence: a corner that
+is under the mask in every view is well inside it in all of them. Objects: the precision of whole
 masks, which are right if half of their pixels are on their class. Recall: of a thing's corners, the
 share that a mask of its class covers in the photograph itself; a logistic function of
 log2(size / 64 px), size the root of the area in an image of 640 px, with an offset for each class.
@@ -310,9 +311,10 @@ def precision(c: Corner, names: tuple[str, ...]) -> tuple[Array, dict, dict[int,
 
 
 def on_thing(c: Corner, names: tuple[str, ...]) -> tuple[Array, dict]:
-    """Log odds that corners under a right mask are on its thing, of all and of those inside.
+    """Log odds that corners under a right mask are on its thing, and offsets of classes.
 
-    And offsets of classes.
+    At evidence 0 and how they grow with it, of all and of those inside. What things lie on is in
+    every view, so evidence does not count for it.
     """
     on = known_rows(c, names)
     on = on[(c.label0[on] == c.label[on]) & (c.covered[on] >= HALF)]
@@ -322,9 +324,12 @@ def on_thing(c: Corner, names: tuple[str, ...]) -> tuple[Array, dict]:
     weights = np.minimum(1.0, ENOUGH / sizes)[group] / ENOUGH
     weights = weights * np.where(c.true[on] == DOUBTFUL, HALF, 1.0)
     inside = (c.inside_px[on] >= WELL_INSIDE_PX).astype(float)
+    evidence = np.where(of_supports[c.label[on].astype(int)], 0.0, c.evidence[on])
     right = (c.true[on] == c.label[on]).astype(float)
-    (a, b), offsets = fit(c.label[on], inside[:, None], right, weights)
-    return a + b * np.array([np.average(inside, weights=weights), 1.0]), offsets
+    features = np.column_stack([inside, evidence, inside * evidence])
+    (a, b, e, f), offsets = fit(c.label[on], features, right, weights)
+    (all_a, all_e), _ = fit(c.label[on], evidence[:, None], right, weights)
+    return np.array([all_a, all_e, a + b, e + f]), offsets
 
 
 def objects(c: Corner, names: tuple[str, ...]) -> tuple[Array, dict]:
@@ -366,7 +371,8 @@ def table(rows: Array, names: tuple[str, ...]) -> list[str]:
         "# precision = sigmoid(a + b logit(score) + c log(evidence) + d evidence + offset), of",
         "# corners under masks; objects: the same of whole masks, without d",
         "# recall = sigmoid(a + b log2(size / 64 px) + offset), size at most 256 px of 640",
-        "# corners = sigmoid(a + offset), on the thing under a right mask: all, and well inside",
+        "# corners = sigmoid(a + d evidence + offset), on the thing under a right mask: all, and",
+        "# those well inside",
         "# Of a class: offsets of precision, objects, recall, corners; corners on other classes.",
     ]
     curves = (("precision", x), ("objects", y), ("recall", z), ("corners", inside))

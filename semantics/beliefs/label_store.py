@@ -141,7 +141,7 @@ class LabelStore:
         at = rows, judged[:, 0].astype(int)
         odds = right[at] / (1 - right[at]) * np.exp(judged[:, 1])
         right[at] = odds / (1 + odds)
-        return self.model.truth(p, scores, right * self.model.on_thing)
+        return self.model.truth(p, scores, right * self.model.on_thing(scores))
 
     def evidence(self, ids: Ints) -> Array:
         """Number of views (N,) of any ids (N,) by their weights and whether they were new."""

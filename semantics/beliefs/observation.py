@@ -44,14 +44,16 @@ class ObservationModel:
     under them is one. Errors of a network repeat themselves from view to view, so that this grows
     slower than by Bayes' rule for independent views; but what is found in every view of a
     photograph is right more often than the logarithm alone lets expect.
-    on_thing = sigmoid(a + offset): the share of corners under a mask that are on the thing, where
-    the mask's thing is of the class: of all, which the precision is of, and of those well inside.
-    Near a mask's edge depth decides in a run, so that landmarks are as those inside.
+    on_thing = sigmoid(a + d e + offset): the share of corners under a mask that are on the thing,
+    where the mask's thing is of the class: of all, which the precision is of, and of those well
+    inside. Near a mask's edge depth decides in a run, so that landmarks are as those inside. It
+    grows with the evidence, since what all views have a mask on is not beside the thing.
     recall = sigmoid(a + b log2(size / 64 px) + offset), size the root of a thing's area in an image
     of 640 pixels.
 
     Attributes:
-        precision: a, b, c, d. objects: a, b, c. recall: a, b. corners: a of all, a inside.
+        precision: a, b, c, d. objects: a, b, c. recall: a, b. corners: a, d of all, a, d
+            inside.
         precision_offsets, object_offsets, recall_offsets, corner_offsets: (C,).
         confused: (C, C) share of the corners under masks of a class (row) on other classes.
         sizes: of the classes.
@@ -98,17 +100,23 @@ class ObservationModel:
 
         That of a corner divided by the share of corners that are on the thing.
         """
-        of_corner = _sigmoid(self.corners[0] + self.corner_offsets)
+        of_corner = self._on_thing(self.corners[:2], seen)
         return np.minimum(self.corner_precision(seen) / of_corner, _MOST_RIGHT)
 
-    @property
-    def on_thing(self) -> Array:
-        """P(a landmark is on the thing under its masks) (C,), where that is of the class.
+    def on_thing(self, seen: Array) -> Array:
+        """P(a landmark is on the thing under its masks) (N, C), where that is of the class.
 
         On what things lie on (tables) they are in the middle of the mask, too.
         """
         supports = self.sizes.is_in(SUPPORT)
-        return _sigmoid(np.where(supports, *self.corners) + self.corner_offsets)
+        every, inside = (self._on_thing(curve, seen) for curve in self.corners.reshape(2, 2))
+        return np.where(supports, every, inside)
+
+    def _on_thing(self, curve: Array, seen: Array) -> Array:
+        a, d = curve
+        evidence = np.clip(seen[:, 1:], *_EVIDENCE_OF_CORNERS)
+        growing = np.where(self.sizes.is_in(SUPPORT), 0.0, d * evidence)
+        return _sigmoid(a + growing + self.corner_offsets)
 
     def truth(self, appearance: Array, seen: Array, right: Array | None = None) -> Array:
         """P(true class) (N, C), given P(class by its appearance) (N, C).

@@ -23,7 +23,8 @@ class AssociationConfig:
     cover the share ``min_overlap`` of the other. The cost of a pair is the share that is not
     covered, plus ``class_weight`` times one minus the affinity of the class distributions, plus
     ``time_weight`` (1 - exp(-t / ``forget_s``)) where t is the time since the object's last
-    sighting; it must not be above ``max_cost``.
+    sighting; it must not be above ``max_cost``. A part of a thing, or what it lies on, overlaps it
+    wholly on one side and is of another class: with 1.0 it would be the same thing.
     """
 
     radius_m: float = 0.03
@@ -32,7 +33,7 @@ class AssociationConfig:
     class_weight: float = 0.5
     time_weight: float = 0.05
     forget_s: float = 30.0
-    max_cost: float = 1.0
+    max_cost: float = 0.75
 
     def reach_m(self, z_m: Array) -> Array:
         """Largest distance of points of one surface, at depths (...)."""

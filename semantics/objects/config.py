@@ -16,6 +16,8 @@ class BoxConfig:
     To the points with ``neighbours`` others within ``support_m`` that hang together over cells of
     ``cell_m``, without parts of fewer points than the share ``part`` of the largest; each side is
     moved in by one sigma of the depth, but leaves at most the share ``trim`` of the points outside.
+    Of the views that show a point and have a mask on the object, the share ``covered`` must have it
+    on the point: what masks show beside an object differs from view to view.
     """
 
     neighbours: int = 2
@@ -23,6 +25,7 @@ class BoxConfig:
     trim: float = 0.02
     cell_m: float = 0.12
     part: float = 0.35
+    covered: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,9 @@ class PublicationConfig:
 
     It must have been seen from enough places: the sum of its views' mask scores, in which further
     ones from one viewpoint hardly count, must be ``min_evidence``; it must be of a class with the
-    probability ``min_probability``, and of one that stands still in rooms. Without a measured model
+    probability ``min_probability``, of one that masks named (how often a network takes one thing
+    for another is known from a few photographs each: enough to doubt a name, not to give one), and
+    of one that stands still in rooms. Without a measured model
     of the masks' errors neither evidence nor probability are asked for.
 
     The longest side of a thing of a class has a log-normal tail beyond its usual range: a standard

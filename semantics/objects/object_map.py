@@ -60,6 +60,7 @@ class _Association:
         overlap: of the detections with them; assigned: (D,) index of the object, or -1.
         rows, owners, points_camera: (N,), (N,), (N, 3) all points of its map segment: their rows
             in the table, their objects, and their positions in the camera frame.
+        shown, covering: (V,), (V,) rows of the visible ones, and the detection on each, or -1.
     """
 
     ids: Ints
@@ -69,6 +70,8 @@ class _Association:
     rows: Ints
     owners: Ints
     points_camera: Array
+    shown: Ints
+    covering: Ints
 
 
 class ObjectMap:
@@ -106,6 +109,7 @@ class ObjectMap:
         cells = viewpoint_cells(centres, view.T_world_camera[:3, 3])
         self.labels.update(objects, detected, scores, cells)
         self._miss(matched, view, objects)
+        self._cover(matched, objects)
         sightings = Sightings(view.keyframe_id, view.timestamp_s, objects)
         self.points.add(sightings, found.points_camera, objects[found.owners])
         self.points.thin(self.config.max_points)
@@ -163,7 +167,9 @@ class ObjectMap:
         evidence = Evidence(detected, self._known(ids), unseen_s)
         assigned = assign(overlap, evidence, config)
         rows = self.points.rows(view.poses)
-        return _Association(ids, evidence.known, overlap, assigned, rows, all_owners, all_points)
+        everything = rows, all_owners, all_points
+        shown = rows[inside[visible]], detections[visible]
+        return _Association(ids, evidence.known, overlap, assigned, *everything, *shown)
 
     def _known(self, ids: Ints) -> Array:
         """The classes (O, C) that objects look like, to be told apart by.
@@ -217,6 +223,13 @@ class ObjectMap:
         T = view.T_world_camera
         cells = viewpoint_cells(transform(T, centres), T[:3, 3])
         self.labels.miss(ids, expected.astype(np.float32), cells)
+
+    def _cover(self, matched: _Association, objects: Ints) -> None:
+        """Count which points of the objects (D,) that are detected the masks of these cover."""
+        owners = self.points.owners(matched.shown)
+        on = np.append(objects, -1)[matched.covering]
+        detected = np.isin(owners, objects)
+        self.points.cover(matched.shown[detected], (on == owners)[detected])
 
     def _revise(self, matched: _Association, found: Detections, objects: Ints) -> Ints:
         """Merge and split objects with enough evidence; the objects (D,) of the detections then."""

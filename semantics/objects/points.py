@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask
 from bmask_slam.graph.geometry import transform
 
 _GOLDEN = 0.6180339887
@@ -29,6 +29,9 @@ class ObjectPoints:
         self._points: Floats = np.zeros((0, 3), np.float32)  # in the anchor keyframe's frame
         self._anchors: Ints = np.zeros(0, np.int64)
         self._owners: Ints = np.zeros(0, np.int64)
+        self._covered: Ints = np.zeros(
+            (0, 2), np.int64
+        )  # views with the point: under the mask, all
         self._sightings: Ints = np.zeros((0, 2), np.int64)  # object, keyframe
         self._seen_s: Array = np.zeros(0)
         self._landmarks: Ints = np.zeros((0, 2), np.int64)  # landmark, object
@@ -48,6 +51,23 @@ class ObjectPoints:
         self._points = np.concatenate([self._points, points.astype(np.float32)])
         self._anchors = np.append(self._anchors, np.full(len(points), sightings.keyframe_id))
         self._owners = np.append(self._owners, owners)
+        self._covered = np.concatenate([self._covered, np.ones((len(points), 2), np.int64)])
+
+    def cover(self, rows: Ints, covered: Mask) -> None:
+        """Count a view that shows rows of points (N,); does its mask of their object cover them?"""
+        self._covered[rows] += np.stack([covered, np.ones(len(rows), bool)], axis=1)
+
+    def covered_shares(self, poses: dict[int, Array]) -> Array:
+        """Of the views that show a point and its object, the share whose mask of it covers it.
+
+        (N,), of the rows whose keyframe has a pose.
+        """
+        under, views = self._covered[self.rows(poses)].T
+        return np.asarray(under / views)
+
+    def owners(self, rows: Ints) -> Ints:
+        """The objects (N,) of rows of points (N,)."""
+        return self._owners[rows]
 
     def in_world(self, poses: dict[int, Array]) -> tuple[Ints, Array]:
         """Objects (N,) and world points (N, 3) of the rows whose keyframe has a pose."""
@@ -117,7 +137,7 @@ class ObjectPoints:
         chosen = np.floor((place + 1) * share + phase) > np.floor(place * share + phase)
         kept = np.sort(order[chosen])
         self._points, self._anchors = self._points[kept], self._anchors[kept]
-        self._owners = self._owners[kept]
+        self._owners, self._covered = self._owners[kept], self._covered[kept]
 
     def anchors(self) -> list[int]:
         """The keyframes whose frames hold points."""
@@ -171,14 +191,17 @@ class ObjectPoints:
             "points": self._points,
             "anchors": self._anchors,
             "owners": self._owners,
+            "covered": self._covered.ravel(),
             "sightings": self._sightings,
             "seen_s": self._seen_s,
             "landmarks": self._landmarks,
         }
 
     def restore(self, state: Arrays) -> None:
-        """Replace the content by a state."""
+        """Replace the content by a state; those of older versions do not say what covers points."""
         self._next_id = int(state["next_id"])
         self._points, self._anchors = state["points"], state["anchors"]
         self._owners, self._sightings = state["owners"], state["sightings"]
+        unknown = np.ones((len(self._owners), 2), np.int64)
+        self._covered = state.get("covered", unknown).reshape(-1, 2).copy()
         self._seen_s, self._landmarks = state["seen_s"], state["landmarks"]

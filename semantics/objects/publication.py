@@ -23,7 +23,7 @@ from bmask_slam.semantics.objects.boxes3d import (
 from bmask_slam.semantics.objects.config import BoxConfig, ObjectConfig, PublicationConfig
 from bmask_slam.semantics.objects.points import ObjectPoints
 
-_SAME_MARGIN_M = 0.05
+_SAME_MARGIN_M, _TOGETHER = 0.05, 0.5
 SMALLEST_M, LARGEST_M = 0.05, 3.5
 """Longest sides of what can be seen in a room."""
 LANDMARK_MARGIN_M = 0.1
@@ -70,26 +70,31 @@ class ObjectSurface:
     Attributes:
         points_world: (N, 3) m. noise_world: (N, 3) their displacement by one sigma of the depth.
         views: (N,) the keyframes that saw them.
+        covered: (N,) of the views that show the object and the point, the share whose mask of the
+            object is on the point.
     """
 
     points_world: Array
     noise_world: Array
     views: Ints
+    covered: Array
 
     @classmethod
     def joined(cls, parts: Sequence[ObjectSurface]) -> ObjectSurface:
         """All points of some."""
-        fields = ("points_world", "noise_world", "views")
+        fields = ("points_world", "noise_world", "views", "covered")
         return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in fields))
 
 
 def fitted(surface: ObjectSurface, up_world: Array, config: BoxConfig) -> tuple[Array, OrientedBox]:
     """The centroid (3,) of the points of an object and the box around them.
 
-    Without outliers, what only one view shows, and noise.
+    Without outliers, what only one view shows, what fewer masks are on than not, and noise.
     """
     points, noise = surface.points_world, surface.noise_world
     near = supported(points, config.neighbours, config.support_m)
+    inside = near & (surface.covered >= config.covered)
+    near = inside if inside.any() else near
     near[near] = seen_again(points[near], surface.views[near], config.support_m)
     near[near] = main_part(points[near], config.cell_m, config.part)
     inner = without_noise(points[near], noise[near], up_world, config.trim)
@@ -103,9 +108,11 @@ def size_and_place(
 
     The logarithm of the longest side is uniform over the usual range with normal tails, and uniform
     over what can be seen of anything for the unknown. Of classes without a range nothing is said.
+    What is taller than its class speaks against it as what is longer does.
     """
-    longest_m = float(box.size_m.max())
-    above = np.maximum(np.log(longest_m / sizes.longest_m), 0) / config.large_sigma
+    longest_m, tall_m = float(box.size_m.max()), float(box.size_m[2])
+    above = np.maximum(np.log(longest_m / sizes.longest_m), np.log(tall_m / sizes.tallest_m))
+    above = np.maximum(above, 0) / config.large_sigma
     below = np.maximum(np.log(sizes.shortest_m / longest_m), 0) / config.small_sigma
     tails = np.sqrt(np.pi / 2) * (config.large_sigma + config.small_sigma)
     width = np.log(sizes.longest_m / sizes.shortest_m) + tails
@@ -117,7 +124,7 @@ def size_and_place(
         bottom_m, top_m = float(heights_m.min()), float(heights_m.max())
         beyond_m = np.zeros(len(found))
         on_floor = sizes.is_in(FLOOR, SUPPORT)
-        beyond_m[on_floor] = np.maximum(top_m - 1.15 * sizes.longest_m, 0)[on_floor]
+        beyond_m[on_floor] = np.maximum(top_m - 1.15 * sizes.tallest_m, 0)[on_floor]
         beyond_m[on_floor] += max(bottom_m - 0.9, 0.0)
         beyond_m[sizes.is_in(TOP)] = max(0.2 - bottom_m, bottom_m - 2.2, 0.0)
         beyond_m[sizes.is_in(WALL)] = max(0.3 - bottom_m, 0.0)
@@ -136,7 +143,8 @@ def same_things(objects: Sequence[MapObject]) -> NDArray[np.int64]:
     """For each object (N,) the index of the one that it is a part of, often itself.
 
     Of two objects of a class, the one that fewer keyframes saw is a part of the other if the centre
-    of its box lies in the other's.
+    of its box lies in the other's, or _SAME_MARGIN_M outside, unless most of these keyframes have a
+    mask on each: books side by side are thinner than that.
     """
     order = sorted(range(len(objects)), key=lambda k: (-len(objects[k].keyframe_ids), k))
     whole = np.arange(len(objects))
@@ -144,7 +152,9 @@ def same_things(objects: Sequence[MapObject]) -> NDArray[np.int64]:
     for k in order:
         for other in kept:
             box = objects[other].box
-            grown = replace(box, size_m=box.size_m + 2 * _SAME_MARGIN_M)
+            both = np.isin(objects[k].keyframe_ids, objects[other].keyframe_ids)
+            margin_m = 0.0 if both.mean() > _TOGETHER else _SAME_MARGIN_M
+            grown = replace(box, size_m=box.size_m + 2 * margin_m)
             centre = objects[k].box.T_world_box[:3, 3]
             if objects[k].label == objects[other].label and grown.contains(centre[None])[0]:
                 whole[k] = other
@@ -205,8 +215,10 @@ class ObjectPublisher:
         owners, points = self._points.in_world(poses)
         noise = self._config.association.depth_sigma_m * self._points.rays_in_world(poses)
         views = self._points.views(poses)
+        covered = self._points.covered_shares(poses)
         rows = {i: owners == i for i in np.unique(owners).tolist()}
-        return {i: ObjectSurface(points[k], noise[k], views[k]) for i, k in rows.items()}
+        tables = points, noise, views, covered
+        return {i: ObjectSurface(*(t[k] for t in tables)) for i, k in rows.items()}
 
     def _candidates(self, by_object: dict[int, ObjectSurface], up_world: Array) -> list[MapObject]:
         """All objects that enough keyframes observed."""
@@ -257,6 +269,9 @@ class ObjectPublisher:
         factors = size_and_place(o.box, ground, self._sizes, config)
         p = judged(o.distribution, factors)
         label = int(p.argmax())
+        looks = self._labels.appearance(np.array([o.id]))[0]
+        named = looks[label] > self._labels.config.prior(len(looks))[label]
         enough = self._labels.evidence(np.array([o.id]))[0] >= config.min_evidence
         sure = label > 0 and p[label] >= config.min_probability and stands_still(self._sizes)[label]
-        return replace(o, label=label, distribution=p) if enough and sure else None
+        reported = named and enough and sure
+        return replace(o, label=label, distribution=p) if reported else None

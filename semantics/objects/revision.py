@@ -15,9 +15,10 @@ class RevisionConfig:
     """When objects are merged or split.
 
     A keyframe is evidence for a merge where one detection covers the share ``covered`` of both
-    objects and their class distributions have an affinity (Bhattacharyya) of ``min_affinity``;
-    against it, where each object has a detection of its own. It is evidence for a split where two
-    detections cover the share ``part`` or more of one object each; a split gives the points nearest
+    objects, the two make up that share of the detection (or it would be what they lie on), and
+    their class distributions have an affinity (Bhattacharyya) of ``min_affinity``; against it,
+    where each object has a detection of its own. It is evidence for a split where two detections
+    cover the share ``part`` or more of one object each; a split gives the points nearest
     to the other detection, within ``reach_m``, to a new object. A revision is made when the
     keyframes for it outnumber those against it by ``needed``; the difference is limited to
     ``most`` against, so that it can be reversed.
@@ -71,7 +72,9 @@ def merges(
     """
     covers = (overlap.of_object >= config.covered) & (overlap.in_view > 0)
     alike = class_affinity(known, known) >= config.min_affinity
-    joint = (covers.astype(int).T @ covers.astype(int) > 0) & alike
+    share = np.where(covers, overlap.of_detection, -1.0)
+    whole = share[:, :, None] + share[:, None] >= config.covered  # no sum with -1 reaches it
+    joint = whole.any(axis=0) & alike
     own = np.zeros(overlap.of_object.shape[1], bool)
     own[assigned[assigned >= 0]] = True
     apart = own[:, None] & own[None]

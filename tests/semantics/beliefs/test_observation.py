@@ -27,7 +27,7 @@ MODEL = ObservationModel(
     precision=np.array([-0.8, 1.0, 0.4, 0.3]),
     objects=np.array([1.0, 1.0, 0.0]),
     recall=np.array([0.0, 0.5]),
-    corners=np.array([1.5, 2.0]),
+    corners=np.array([1.5, 0.5, 2.0, 1.0]),
     precision_offsets=np.array([0.0, 0.0, 0.5, 0.0]),
     object_offsets=np.zeros(4),
     recall_offsets=np.zeros(4),
@@ -66,19 +66,23 @@ def test_a_landmark_is_right_as_its_thing_is_and_as_corners_well_inside_are() ->
     corner = MODEL.corner_precision(seen)[0]
     assert corner[1:] == pytest.approx([sigmoid(0.2), sigmoid(0.7), sigmoid(-0.1)])
     thing = MODEL.thing_precision(seen)[0]
-    assert thing[1:] == pytest.approx(corner[1:] / [sigmoid(1.5), sigmoid(2.0), sigmoid(1.5)])
+    assert thing[1:] == pytest.approx(corner[1:] / [sigmoid(2.0), sigmoid(2.5), sigmoid(1.5)])
     assert MODEL.thing_precision(np.array([[4.0, 1.0]])).max() == pytest.approx(0.98)
-    assert MODEL.on_thing[1:] == pytest.approx([sigmoid(2.0), sigmoid(2.5), sigmoid(1.5)])
+    inside = MODEL.on_thing(seen)[0]  # a couch's evidence does not count
+    assert inside[1:] == pytest.approx([sigmoid(3.0), sigmoid(3.5), sigmoid(1.5)])
+    most = MODEL.on_thing(np.array([[0.7, 1e9]]))[0]
+    assert sigmoid(3.0) < most[1] < sigmoid(2.0 + 5.0)  # it grows as far as it was measured
     store, one = LabelStore(4, model=MODEL), np.array([0])
     cup = np.array([[0.0, 1, 0, 0]], np.float32)
     for place in range(8):  # there is no doubt of what it looks like
         store.update(one, cup, np.array([0.9], np.float32), np.array([place]))
     scores = store._scores[:1] / [store._scores[0, 1], 1]
+    on = MODEL.on_thing(scores)[0, 1]
     right = MODEL.thing_precision(scores)[0, 1]
-    assert store.probabilities(one)[0, 1] == pytest.approx(right * sigmoid(2.0), abs=2e-3)
+    assert store.probabilities(one)[0, 1] == pytest.approx(right * on, abs=2e-3)
     store.judge(one, np.array([1]), np.array([1.5]))  # of a cup's size, and on a table
     odds = right / (1 - right) * np.exp(1.5)
-    expected = odds / (1 + odds) * sigmoid(2.0)
+    expected = odds / (1 + odds) * on
     assert store.probabilities(one)[0, 1] == pytest.approx(expected, abs=2e-3)
 
 
@@ -130,7 +134,7 @@ def test_a_table_seen_often_does_not_hide_the_book_on_it() -> None:
     curved = ("precision", "object", "recall", "corner")
     nothing = {f"{name}_offsets": np.zeros(count) for name in curved}
     curves = {"precision": np.array([3.0, 0, 0, 0]), "objects": np.array([4.0, 0, 0])}
-    curves["corners"] = np.array([4.0, 4.0])
+    curves["corners"] = np.array([4.0, 0.0, 4.0, 0.0])
     confused, sizes = np.zeros((count, count)), read_sizes(names)
     model = replace(MODEL, **curves, **nothing, confused=confused, sizes=sizes)
     table, book = np.zeros((2, 1, count), np.float32)

@@ -23,6 +23,7 @@ from bmask_slam.semantics.objects.object_map import (
 )
 from bmask_slam.semantics.objects.points import ObjectPoints, Sightings
 from bmask_slam.semantics.objects.publication import MapObject
+from bmask_slam.semantics.objects.revision import RevisionConfig, merges
 
 CAMERA = Camera(320, 240, fx=260.0, fy=262.0, cx=160.5, cy=119.0)
 SIZE = (240, 320)
@@ -182,6 +183,32 @@ def test_an_object_is_split_when_masks_separate_it() -> None:
     assert 0 in found[1].keyframe_ids
 
 
+def test_what_few_masks_show_beside_a_thing_is_not_in_its_box() -> None:
+    scene, both = Scene(), [CHAIRS[0], Card(0.01, 0.42, 2)]
+    for k, x in enumerate(PATH):
+        scene.show(x, [Card(-0.42, 0.42)] if k in (2, 4) else both)  # the mask of a chair spills
+    found = next(o for o in scene.objects() if o.label == 1)
+    assert found.box.size_m[:2].max() == pytest.approx(0.41, abs=0.05)
+    state = scene.map.state()
+    restored = ObjectMap(CAMERA, LabelStore(C))
+    restored.restore(state)
+    (again,) = (o for o in restored.objects(scene.poses, Ground(UP)) if o.label == 1)
+    assert np.array_equal(again.box.size_m, found.box.size_m)
+    del state["points.covered"]  # as older versions wrote it
+    restored.restore(state)
+    (old,) = (o for o in restored.objects(scene.poses, Ground(UP)) if o.label == 1)
+    assert old.box.size_m[:2].max() > 0.6
+
+
+def test_a_desk_under_two_things_is_no_evidence_that_they_are_one() -> None:
+    in_view, alike = np.array([40, 40]), np.tile([0.0, 1.0], (2, 1))
+    config, unassigned = RevisionConfig(), np.array([-1])
+    covered = np.array([[0.9, 0.9]])
+    for share, expected in ((0.4, [(0, 1, 1)]), (0.1, [])):  # of the detection that is on each
+        overlap = Overlap(np.array([[share, share]]), covered, in_view)
+        assert merges(overlap, unassigned, alike, config) == expected
+
+
 def test_one_wrong_class_neither_makes_an_object_nor_changes_its_label() -> None:
     scene = Scene()
     for k, x in enumerate(PATH):
@@ -295,3 +322,12 @@ def test_objects_of_another_map_become_those_that_are_where_they_are() -> None:
     assert points.landmarks_of(1).tolist() == [7]
     assert points.landmarks_of(4).tolist() == [8]
     assert scene.map.join(scene.poses, 4, 5) == 0
+
+
+def test_what_covers_a_thing_wholly_and_is_of_another_class_is_another_thing() -> None:
+    covers, own = np.array([[0.05]]), np.array([[1.0]])
+    book, desk = np.array([[0.0, 1.0, 0.0]]), np.array([[0.0, 0.1, 0.9]])
+    for detected, on, expected in ((desk, covers, -1), (book, covers, 0), (desk, own, 0)):
+        overlap = Overlap(on, own, np.array([40]))
+        found = assign(overlap, Evidence(detected, book, np.zeros(1)), AssociationConfig())
+        assert found.tolist() == [expected]

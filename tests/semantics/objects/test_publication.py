@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,23 +11,27 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import se3_exp, transform
 from bmask_slam.semantics.beliefs.class_sizes import read_sizes
+from bmask_slam.semantics.beliefs.label_store import LabelStore
+from bmask_slam.semantics.beliefs.observation import ObservationModel
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
-from bmask_slam.semantics.objects.config import PublicationConfig
+from bmask_slam.semantics.objects.config import ObjectConfig, PublicationConfig
 from bmask_slam.semantics.objects.gravity import GravityEstimator
 from bmask_slam.semantics.objects.object_map import pixel_rays
+from bmask_slam.semantics.objects.points import ObjectPoints, Sightings
 from bmask_slam.semantics.objects.publication import (
     LARGEST_M,
     SMALLEST_M,
     Ground,
     MapObject,
+    ObjectPublisher,
     judged,
     same_things,
     size_and_place,
     stands_still,
 )
 
-NAMES = label_set(("cup", "chair", "couch", "tv", "person"))
+NAMES = label_set(("cup", "chair", "couch", "tv", "person", "laptop"))
 SIZES = read_sizes(NAMES)
 CONFIG = PublicationConfig()
 T_WORLD_ROOM = se3_exp(np.array([0.4, -0.9, 1.3, 2.0, -5.0, 1.0]))
@@ -63,6 +69,15 @@ def test_sizes_tell_classes_apart() -> None:
     assert log_p("cup", (0.3, 0.1, 0.1), 0.75) == pytest.approx(usual - 0.5 * beyond**2)
 
 
+def test_heights_tell_classes_apart() -> None:
+    screen, open_laptop = (0.4, 0.08, 0.4), (0.35, 0.25, 0.25)
+    usual = log_p("laptop", open_laptop, 0.75)
+    assert usual > log_p("tv", screen, 0.75) > 0
+    beyond = np.log(0.4 / 0.28) / CONFIG.large_sigma
+    assert log_p("laptop", screen, 0.75) == pytest.approx(usual - 0.5 * beyond**2)
+    assert log_p("laptop", (0.4, 0.4, 0.08), 0.75) == usual  # only what stands up is tall
+
+
 def test_places_tell_classes_apart_by_heights_above_the_floor() -> None:
     chair = (0.5, 0.5, 0.9)
     usual = log_p("chair", chair, 0.0)
@@ -76,9 +91,9 @@ def test_places_tell_classes_apart_by_heights_above_the_floor() -> None:
     assert log_p("cup", cup, 0.0) == pytest.approx(log_p("cup", cup, 0.7) - 0.5 * (0.2 / 0.15) ** 2)
     nowhere = size_and_place(box(chair, 1.6), Ground(GROUND.up_world), SIZES, CONFIG)
     assert nowhere[2] == pytest.approx(usual)  # nothing is known without a floor
-    p = judged(np.array([0.3, 0.0, 0.7, 0, 0, 0]), np.array([0, 0, -2.0, 0, 0, 0]))
+    p = judged(np.array([0.3, 0.0, 0.7, 0, 0, 0, 0]), np.array([0, 0, -2.0, 0, 0, 0, 0]))
     assert p[2] == pytest.approx(0.7 * np.exp(-2) / (0.3 + 0.7 * np.exp(-2)))
-    assert stands_still(SIZES).tolist() == [True, True, True, True, True, False]
+    assert stands_still(SIZES).tolist() == [True, True, True, True, True, False, True]
 
 
 def thing(number: int, label: int, at: OrientedBox, keyframes: int) -> MapObject:
@@ -93,6 +108,14 @@ def test_a_part_of_a_thing_is_joined_to_it() -> None:
     assert same_things(things).tolist() == [1, 1, 2]
     things[0] = thing(4, 1, part, 3)  # of another class
     assert same_things(things).tolist() == [0, 1, 2]
+
+
+def test_books_side_by_side_are_two() -> None:
+    first, second = box((0.03, 0.2, 0.25), 1.2), box((0.03, 0.2, 0.25), 1.2, 0.035)
+    books = [thing(1, 1, first, 6), thing(2, 1, second, 4)]
+    assert same_things(books).tolist() == [0, 1]  # keyframes have a mask on each
+    books[1] = replace(books[1], keyframe_ids=np.arange(5, 9))
+    assert same_things(books).tolist() == [0, 0]  # now the one, now the other
 
 
 CAMERA = Camera(320, 240, fx=250.0, fy=250.0, cx=159.5, cy=119.5)
@@ -143,3 +166,28 @@ def test_landmarks_behind_a_thing_are_not_on_it() -> None:
     found = MapObject(7, 2, np.eye(6)[2], np.zeros(3), chair, none, ids, 0.0, 1.0)
     kept = found.with_landmarks_at(transform(T_WORLD_ROOM, room)).landmark_ids
     assert kept.tolist() == [0, 1]  # the second is 9 cm outside, the third 1.75 m behind
+
+
+def test_an_object_has_a_name_that_masks_gave_it() -> None:
+    """A flat box of 35 cm looks like a telephone, which a laptop does in three of ten cases."""
+    names = label_set(("cell phone", "laptop"))
+    confused = np.zeros((3, 3))
+    confused[1, 2] = 0.3
+    none = np.zeros(3)
+    model = ObservationModel(
+        np.zeros(4), np.array([0.5, 0, 0]), np.zeros(2), np.zeros(4), none, none, none, none,
+        confused, read_sizes(names),
+    )  # fmt: skip
+    corners = np.stack(np.meshgrid([0, 0.35], [0, 0.25], [0, 0.04], indexing="ij"), -1)
+    room = corners.reshape(-1, 3) + np.array([1.0, 1.0, 0.75])
+    for named, expected in ((1, []), (2, [2])):
+        points, labels = ObjectPoints(), LabelStore(3, model=model, of_objects=True)
+        views = np.array([[0, 1, 0], [0, 1, 0], np.eye(3)[named]], np.float32)
+        points.new_ids(1)
+        for k, view in enumerate(views):
+            labels.update(np.zeros(1, int), view[None], np.ones(1, np.float32), np.array([k]))
+            points.add(Sightings(k, float(k), np.zeros(1, int)), room, np.zeros(8, int))
+        publisher = ObjectPublisher(points, labels, ObjectConfig(), read_sizes(names))
+        ground = Ground(UP_ROOM, 0.0)
+        found = publisher.objects({k: np.eye(4) for k in range(3)}, ground)
+        assert [o.label for o in found] == expected
