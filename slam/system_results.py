@@ -102,8 +102,8 @@ class SystemResults(ABC):
         hosts = [k.id for k in chosen]
         ids = np.flatnonzero(table.in_map & np.isin(table.host, hosts))
         labels = self.semantics.landmark_labels(ids, chosen)
-        columns = table.points_world[ids], table.colours[ids], table.observations[ids]
-        return LandmarkCloud(ids, *columns, labels)
+        views = table.observations[ids].astype(np.int64)
+        return LandmarkCloud(ids, table.points_world[ids], table.colours[ids], views, labels)
 
     def objects(self) -> MapObjects:
         """The objects of the largest segment."""

@@ -147,12 +147,12 @@ class DeltaMaker:
 
 
 def digest_rows(columns: Sequence[NDArray]) -> Bits:
-    """A number (N,) for each row of columns of 8-byte entries (N, ...): equal for equal bytes.
+    """A number (N,) for each row of columns (N, ...) of int32 or 8 bytes: equal for equal bytes.
 
     Two rows that differ have the same number with a probability of 2^-64.
     """
     digests = np.zeros(len(columns[0]), np.uint64)
-    for column in columns:
+    for column in (c.astype(np.int64) if c.dtype == np.int32 else c for c in columns):
         for words in np.ascontiguousarray(column).reshape(len(column), -1).view(np.uint64).T:
             digests = (digests ^ words) * _ODD
             digests ^= digests >> _HALF

@@ -22,22 +22,24 @@ from bmask_slam.world.appearance import (
 
 _OF_ALL: Columns = {
     "points_world": ((3,), np.float64, np.nan),
-    "host": ((), np.int64, -1),
-    "last_keyframe": ((), np.int64, -1),
-    "observations": ((), np.int64, 0),
-    "visible": ((), np.int64, 0),
-    "found": ((), np.int64, 0),
-    "replaced_by": ((), np.int64, -1),
+    "host": ((), np.int32, -1),
+    "last_keyframe": ((), np.int32, -1),
+    "observations": ((), np.int32, 0),
+    "visible": ((), np.int32, 0),
+    "found": ((), np.int32, 0),
+    "replaced_by": ((), np.int32, -1),
     "in_map": ((), np.bool_, False),
     "in_graph": ((), np.bool_, False),
 }
 _COLUMNS = _OF_ALL | APPEARANCE
 BLOCK = 4096  # landmarks whose appearance is copied at once
-_ROW: Columns = {"row": ((), np.int64, 0)}
+_ROW: Columns = {"row": ((), np.int32, 0)}
 
 
 class LandmarkTable:
     """Columns over landmark ids; every attribute is an array view of the rows in use.
+
+    Integers are int32, since most rows are of removed landmarks, which are kept for ever.
 
     Attributes:
         points_world: (N, 3) metres.
@@ -208,8 +210,11 @@ class LandmarkTable:
 
     def _rows_of(self, ids: Ints, name: str) -> NDArray:
         column = getattr(self, name)
+        like = column[ids[:0]]
+        if like.dtype == np.int32:
+            return column[ids].astype(np.int64)  # as files have it
         pieces = (column[ids[k : k + BLOCK]] for k in range(0, len(ids), BLOCK))
-        return concatenated(pieces, len(ids), column[ids[:0]])
+        return concatenated(pieces, len(ids), like)
 
     def restore(self, state: Arrays) -> None:
         """Become the table of a state; this table must be new. Raises ValueError."""
