@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bmask_slam.graph.arrays import Array, Image, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.mapping.inverse_depth.backprojection import MAX_STEP, back_project, surface_normals
+from bmask_slam.mapping.inverse_depth.backprojection import back_project, surface_normals
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
 
 MIN_COSINE = 0.15
@@ -19,6 +19,10 @@ MIN_COSINE = 0.15
 MIN_SIGMA_M = 0.01
 """Error of a distance beside that of its own pixel: of the pose and of the sensor's calibration."""
 BEHIND_SIGMAS, BEHIND_VOXELS = 3.0, (3, 8)
+RIM, RIM_M, RIM_BEHIND_VOXELS = 0.1, 0.01, 2
+"""Weight of pixels beside a step of depth or a hole, which must be so near to the plane of a pixel
+beside them, and how far behind the surface they count."""
+NEIGHBOURS = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx]
 SILHOUETTE_PX = 3
 """Silhouettes of depth are not exact to a pixel."""
 PAINT_PX, GLARE, FAINT = 8, 250, 0.01
@@ -65,21 +69,23 @@ def depth_frame(
 
     A voxel's distance is that to the plane of the pixel on which it falls: normal . (q - p), which
     unlike a difference of depths has no bias on a slope and none by rounding to a pixel. Its
-    variance is (sigma_z cos(angle))^2 + MIN_SIGMA_M^2. Rims tell nothing: there a sensor's depth is
-    of neither side.
+    variance is (sigma_z cos(angle))^2 + MIN_SIGMA_M^2. Beside steps of depth and holes, where a
+    sensor's depth may be of neither side, a pixel counts RIM, on the plane of a neighbour, or not.
     """
     points = back_project(measured, camera)
     normals = surface_normals(measured, camera)
+    rims = _extend(normals, points)
     offset, z = (normals * points).sum(-1), points[..., 2]
     cosine = -offset / torch.linalg.norm(points, dim=-1)
     variance = (measured.variance.sqrt() * z.square() * cosine).square() + MIN_SIGMA_M**2
-    good = (cosine > MIN_COSINE) & ~_rims(measured.rho) & torch.isfinite(variance)
+    good = (cosine > MIN_COSINE) & torch.isfinite(variance)
     least, most = BEHIND_VOXELS
+    behind_m = (BEHIND_SIGMAS * variance.sqrt()).clamp(least * voxel_m, most * voxel_m)
     columns = {
         OFFSET: offset,
-        WEIGHT: 1e-4 / variance,
+        WEIGHT: torch.where(rims, RIM, 1.0) * 1e-4 / variance,
         Z: z,
-        BEHIND: (BEHIND_SIGMAS * variance.sqrt()).clamp(least * voxel_m, most * voxel_m),
+        BEHIND: torch.where(rims, RIM_BEHIND_VOXELS * voxel_m, behind_m),
         WITNESS: torch.ones_like(z),
     }
     pixels = torch.empty((*z.shape, 8))
@@ -88,13 +94,18 @@ def depth_frame(
         pixels[..., column] = values
     pixels[~good] = 0
     pixels = pixels.reshape(-1, 8)
-    paint = torch.empty((len(pixels), 4))
-    paint[:, :3] = torch.from_numpy(rgb).reshape(-1, 3)
-    clear = (_least_around(pixels[:, Z], z.shape, PAINT_PX) > 0) & (paint[:, :3] < GLARE).all(1)
-    best = (cosine / z.square()).reshape(-1).nan_to_num_().clamp_(*SIGHT)
-    paint[:, 3] = best * torch.where(clear, 1, FAINT)
+    inner = pixels[:, Z] * ~rims.reshape(-1)
+    clear = _least_around(inner, z.shape, PAINT_PX) > 0
+    sight = (cosine / z.square()).reshape(-1).nan_to_num_().clamp_(*SIGHT)
     free_m = _least_around(z.nan_to_num(), z.shape, SILHOUETTE_PX)
-    return DepthFrame(pixels, free_m, paint, T_world_camera)
+    return DepthFrame(pixels, free_m, _paint(rgb, clear, sight), T_world_camera)
+
+
+def _paint(rgb: Image, clear: Tensor, sight: Tensor) -> Tensor:
+    """Colours (H W, 4) with their weights, of which clear pixels (H W,) have the full ``sight``."""
+    colours = torch.from_numpy(rgb).reshape(-1, 3).to(torch.float32)
+    weight = sight * torch.where(clear & (colours < GLARE).all(1), 1, FAINT)
+    return torch.cat([colours, weight[:, None]], 1)
 
 
 def _least_around(values: Tensor, shape: torch.Size, radius: int) -> Tensor:
@@ -108,15 +119,24 @@ def mark_unexplained(frame: DepthFrame, unexplained: Mask) -> None:
     frame.pixels[torch.from_numpy(unexplained.reshape(-1)), WITNESS] = UNEXPLAINED
 
 
-def _rims(rho: Tensor) -> Tensor:
-    """Pixels (H, W) beside a hole or a step of inverse depth (H, W)."""
-    found = torch.zeros_like(rho, dtype=torch.bool)
-    for image, at in ((rho, found), (rho.T, found.T)):
-        a, b = image[:, 1:], image[:, :-1]
-        apart = ~((a - b).abs() < MAX_STEP * torch.maximum(a, b))
-        at[:, 1:].logical_or_(apart)
-        at[:, :-1].logical_or_(apart)
-    return found
+def _extend(normals: Tensor, points: Tensor) -> Tensor:
+    """Give points (H, W, 3) without a normal that of a neighbour on whose plane they lie, in place.
+
+    Returns which they are (H, W): those beside a hole or a step of depth.
+    """
+    lone = torch.isfinite(points[..., 2]) & ~torch.isfinite(normals[..., 0])
+    lone[[0, -1]] = lone[:, [0, -1]] = False
+    rows, columns = torch.nonzero(lone).unbind(-1)
+    own, best = points[rows, columns], torch.full((len(rows),), RIM_M)
+    found = torch.full((len(rows), 3), torch.nan)
+    for dy, dx in NEIGHBOURS:
+        at = rows + dy, columns + dx
+        normal = normals[at]
+        apart = ((own - points[at]) * normal).sum(-1).abs()
+        nearer = apart < best  # never where NaN
+        best, found = torch.where(nearer, apart, best), torch.where(nearer[:, None], normal, found)
+    normals[rows, columns] = found
+    return lone
 
 
 def gains(seen: Tensor, known: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from surface_scene import CAMERA, as_map, plane_rho, poses
 
 from bmask_slam.graph.arrays import Array
@@ -15,7 +16,14 @@ from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, transform
 from bmask_slam.mapping.open3d_loader import load_open3d
 from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.mesh_files import write_glb, write_mesh
-from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame, mark_unexplained
+from bmask_slam.mapping.surface.depth_frame import (
+    NX,
+    RIM,
+    WEIGHT,
+    DepthFrame,
+    depth_frame,
+    mark_unexplained,
+)
 from bmask_slam.mapping.surface.extraction import MIN_WITNESSES, Surface, extract, without_crumbs
 from bmask_slam.mapping.surface.gate import KeyframeSurface, judge_of
 from bmask_slam.mapping.surface.volume import SurfaceVolume
@@ -159,6 +167,19 @@ def test_the_limit_between_behind_and_free_is_no_surface() -> None:
     assert np.abs(found[:, 2] - 2.0).max() < 0.5 * VOXEL_M
 
 
+def test_rims_count_little_and_what_flies_beside_them_not_at_all() -> None:
+    rho = np.full((30, 40), 0.5)
+    rho[:, 20:] = 1 / 3.0
+    rho[10, 20] = 1 / 2.4
+    pixels = frame(rho, np.eye(4)).pixels.reshape(30, 40, 8)
+    weight, normal = pixels[..., WEIGHT], pixels[..., NX : NX + 3]
+    np.testing.assert_allclose(weight[4:8, 19], RIM * weight[4:8, 18], rtol=0.05)
+    np.testing.assert_allclose(
+        normal[4:8, 18:22], torch.tensor([0.0, 0, -1]).expand(4, 4, 3), atol=1e-5
+    )
+    assert weight[10, 20] == 0
+
+
 def test_a_thin_wall_has_two_sides() -> None:
     thick_m, T = 3 * VOXEL_M, np.eye(4)
     behind = make_pose(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 4.0 + thick_m]))
@@ -171,7 +192,7 @@ def test_a_thin_wall_has_two_sides() -> None:
 def test_crumbs_are_removed_and_what_is_left_stays_a_mesh() -> None:
     rho = np.full((30, 40), np.nan)
     rho[4:26, 2:22] = 0.5
-    rho[10:16, 28:34] = 0.5
+    rho[10:14, 28:31] = 0.5
     found = surface_of([frame(rho, np.eye(4))] * 3)
     kept = without_crumbs(found, VOXEL_M)
     assert found.vertices[:, 0].max() > 0.4 > kept.vertices[:, 0].max()
