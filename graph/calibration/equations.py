@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import bsr_array
+from scipy.sparse import bsr_array, csr_array
 
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.calibration.model import CalibrationViews, linearise
 from bmask_slam.graph.calibration.problem import CalibrationProblem, CalibrationState, N, add_priors
 
@@ -36,32 +36,42 @@ def normal_equations(
     r, J_c, J_l, J_k = (
         lin.residuals * root[..., 0], lin.pose * root, lin.point * root, lin.calibration * root,
     )  # fmt: skip
-    H_ll, g_l = np.zeros((L, 3, 3)), np.zeros((L, 3))
-    np.add.at(H_ll, views.landmarks, J_l.swapaxes(1, 2) @ J_l)
-    np.add.at(g_l, views.landmarks, np.einsum("mri,mr->mi", J_l, r))
+    of_landmarks, of_keyframes = _Sums(views.landmarks, L), _Sums(views.keyframes, K)
+    H_ll = of_landmarks(J_l.swapaxes(1, 2) @ J_l)
+    g_l = of_landmarks(np.einsum("mri,mr->mi", J_l, r))
     inverse_ll = inverse_information(_damped(H_ll, damping))
-    cross_c, cross_k = J_c.swapaxes(1, 2) @ J_l, np.zeros((L, N, 3))
-    np.add.at(cross_k, views.landmarks, J_k.swapaxes(1, 2) @ J_l)
+    cross_c, cross_k = J_c.swapaxes(1, 2) @ J_l, of_landmarks(J_k.swapaxes(1, 2) @ J_l)
 
-    H_c, g_c, H_ck = np.zeros((K, 6, 6)), np.zeros((K, 6)), np.zeros((K, 6, N))
     shrunk = cross_c @ inverse_ll[views.landmarks]
-    np.add.at(H_c, views.keyframes, J_c.swapaxes(1, 2) @ J_c)
-    np.add.at(g_c, views.keyframes, np.einsum("mri,mr->mi", J_c, r))
+    H_c = of_keyframes(J_c.swapaxes(1, 2) @ J_c)
     S_ck = J_c.swapaxes(1, 2) @ J_k - shrunk @ cross_k[views.landmarks].swapaxes(1, 2)
-    np.add.at(H_ck, views.keyframes, S_ck)
-    b_c = g_c.copy()
-    np.add.at(b_c, views.keyframes, -np.einsum("mij,mj->mi", shrunk, g_l[views.landmarks]))
+    H_ck = of_keyframes(S_ck)
+    known = np.einsum("mij,mj->mi", shrunk, g_l[views.landmarks])
+    b_c = of_keyframes(np.einsum("mri,mr->mi", J_c, r) - known)
     shrunk_k = cross_k @ inverse_ll
-    H_k = _damped(np.einsum("mri,mrj->ij", J_k, J_k), damping)
+    flat = J_k.reshape(-1, N)
+    H_k = _damped(flat.T @ flat, damping)
     S: Array = np.zeros((6 * K + N, 6 * K + N))
     S[:-N, :-N] = _block_diagonal(_damped(H_c, damping)) - _product(views, shrunk, cross_c, K, L)
     S[:-N, -N:] = H_ck.reshape(6 * K, N)
     S[-N:, :-N] = S[:-N, -N:].T
     S[-N:, -N:] = H_k - np.einsum("lik,ljk->ij", shrunk_k, cross_k)
-    b_k = np.einsum("mri,mr->i", J_k, r) - np.einsum("lij,lj->i", shrunk_k, g_l)
+    b_k = flat.T @ r.ravel() - np.einsum("lij,lj->i", shrunk_k, g_l)
     b = np.concatenate([b_c.ravel(), b_k])
     add_priors(problem, state, S, b)
     return Reduced(S, b, inverse_ll, g_l, cross_c, cross_k)
+
+
+class _Sums:
+    """Adds up rows (M, ...) of the same group, one of ``count`` for each row (M,)."""
+
+    def __init__(self, groups: Ints, count: int) -> None:
+        rows = np.arange(len(groups))
+        self._chosen = csr_array((np.ones(len(rows)), (groups, rows)), shape=(count, len(rows)))
+
+    def __call__(self, rows: Array) -> Array:
+        sums = self._chosen @ rows.reshape(len(rows), -1)
+        return np.asarray(sums).reshape(-1, *rows.shape[1:])
 
 
 def inverse_information(H: Array) -> Array:

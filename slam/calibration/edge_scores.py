@@ -105,6 +105,7 @@ def edges_of(rgb: Image, depth_m: Array) -> EdgeImages:
     by_column, by_row = (
         np.abs(cv2.Sobel(grey, cv2.CV_32F, *order, scale=1 / 8)) for order in ((1, 0), (0, 1))
     )
+    depth_m = depth_m.astype(np.float32)
     return EdgeImages(
         (_depth_edges(depth_m), np.ascontiguousarray(_depth_edges(depth_m.T).T)),
         (_normalised(by_column), _normalised(by_row)),

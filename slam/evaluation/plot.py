@@ -18,6 +18,8 @@ from bmask_slam.graph.trajectory import Trajectory, associate, nearest_indices
 from bmask_slam.graph.whole_file import whole_file
 
 ESTIMATE, REFERENCE, DIFFERENCE = "#1f5fa8", "#9a9a96", "#d6302a"
+MARGINS = {"left": 0.075, "right": 0.985, "bottom": 0.105, "top": 0.915}
+"""Of the plot; a layout that measures all of its text takes half of the time of drawing it."""
 GAP_STEPS = 5
 FORMATS = ("png", "pdf", "svg")
 MARKS = {
@@ -56,13 +58,14 @@ def plot_trajectory(
         raise InputError(f"{path}: unknown suffix {path.suffix!r}; use .png, .pdf or .svg")
     matched, truth = associate(estimate, reference) if reference is not None else (estimate, None)
     if truth is None or len(truth) < 3:
-        figure = Figure(figsize=(6.4, 5.6), dpi=150, layout="constrained")
-        top_view, aligned = figure.add_subplot(), estimate
+        figure = Figure(figsize=(6.4, 5.6), dpi=150)
+        grid = figure.add_gridspec(1, 1, left=0.13, right=0.98, bottom=0.1, top=0.92)
+        top_view, aligned = figure.add_subplot(grid[0]), estimate
         draw_top_view(top_view, estimate)
     else:
         error = absolute_error(matched, truth, with_scale)
-        figure = Figure(figsize=(11, 5.2), dpi=150, layout="constrained")
-        grid = figure.add_gridspec(2, 2, width_ratios=(1.1, 1))
+        figure = Figure(figsize=(11, 5.2), dpi=150)
+        grid = figure.add_gridspec(2, 2, width_ratios=(1.1, 1), wspace=0.18, hspace=0.08, **MARGINS)
         top_view, aligned = figure.add_subplot(grid[:, 0]), error.alignment.apply(estimate)
         draw_top_view(top_view, aligned, reference, (error.aligned, truth))
         draw_errors([figure.add_subplot(grid[k, 1]) for k in range(2)], error)

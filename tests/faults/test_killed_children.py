@@ -63,10 +63,11 @@ def test_every_tracked_pose_is_saved(slow_office: Path, tmp_path: Path, seed: in
             arrived = slam.track(frame.timestamp_s, frame.rgb, frame.depth_m, name=frame.name)
             if arrived.T_world_camera is not None:
                 tracked.append(frame.timestamp_s)
+            slam.catch_up(waiting=2)  # frames do not run ahead of a process that is started again
     files = (tmp_path / "run").glob("trajectory*.txt")
     saved = [stamp_s for path in files for stamp_s in read_tum(path).timestamps_s.tolist()]
     assert sorted(saved) == pytest.approx(tracked, abs=1e-6), plan
-    assert len(tracked) > FRAMES / 4, plan  # how long a restart takes is the machine's matter
+    assert len(tracked) > FRAMES / 4, plan
     assert (tmp_path / "run" / "map").is_file(), plan
     assert children() <= before, plan
     assert set(os.listdir("/dev/shm")) <= memory, plan
