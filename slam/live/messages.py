@@ -44,7 +44,7 @@ class NewKeyframe:
         local_ids: (N,) landmarks that it was tracked against.
         visibility: counts of the frames since the last keyframe.
         history: the frames since the last keyframe.
-        depth_m: (h, w) every second pixel of its z-depth, for its masks.
+        depth_m: (h, w) every second pixel of its z-depth, for its masks; (0, w) if there are none.
     """
 
     id: int

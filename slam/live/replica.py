@@ -7,6 +7,7 @@ of them, but descriptors, patches and observations only where they changed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
@@ -153,7 +154,8 @@ def digest_rows(columns: Sequence[NDArray]) -> Bits:
     """
     digests = np.zeros(len(columns[0]), np.uint64)
     for column in (c.astype(np.int64) if c.dtype == np.int32 else c for c in columns):
-        for words in np.ascontiguousarray(column).reshape(len(column), -1).view(np.uint64).T:
+        flat = np.ascontiguousarray(column).reshape(len(column), math.prod(column.shape[1:]))
+        for words in flat.view(np.uint64).T:
             digests = (digests ^ words) * _ODD
             digests ^= digests >> _HALF
     return digests

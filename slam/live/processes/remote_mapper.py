@@ -73,7 +73,7 @@ class RemoteMapper:
         self.loops_closed = 0
         self.changes = 0
         self.reference: Keyframe | None = None
-        self._folder = folder
+        self._folder, self._has_labels = folder, len(names) > 1
         self._sent_frames = 0
         self._saved_keyframes = 0
         self._pending: set[int] = set()
@@ -125,7 +125,7 @@ class RemoteMapper:
                 local_ids,
                 self._visibility_counts(),
                 self._unsent_history(),
-                kept_depth(frame.depth_m),
+                kept_depth(frame.depth_m if self._has_labels else frame.depth_m[:0]),
             )
         )
         return keyframe

@@ -10,7 +10,7 @@ from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.geometry import se3_exp
-from bmask_slam.live.replica import COLUMNS, DeltaMaker, apply_delta
+from bmask_slam.live.replica import COLUMNS, DeltaMaker, apply_delta, digest_rows
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.frame_history import FrameHistory
@@ -124,3 +124,18 @@ def test_an_owner_restarted_from_an_older_state_is_followed() -> None:
     apply_delta(after.delta(world, frames), copy, history)
     equal(copy, world)
     assert all(history.parent(k)[0] == frames.parent(k)[0] for k in culled)
+
+
+def test_digests_tell_rows_apart() -> None:
+    rng = np.random.default_rng(3)
+    columns = [rng.normal(size=(50, 4, 3)), np.arange(50, dtype=np.int32), rng.normal(size=(50, 3))]
+    columns[0][7, 2] = np.nan  # a patch that is not there
+    digests = digest_rows(columns)
+    assert len(np.unique(digests)) == 50
+    np.testing.assert_array_equal(digest_rows([c.copy() for c in columns]), digests)
+    for column in columns:
+        changed = [c.copy() if c is column else c for c in columns]
+        altered = next(c for c, old in zip(changed, columns, strict=True) if c is not old)
+        altered[20:22] = -altered[20:22]  # two signs: they must not cancel
+        assert np.flatnonzero(digest_rows(changed) != digests).tolist() == [20, 21]
+    assert len(digest_rows([c[:0] for c in columns])) == 0
