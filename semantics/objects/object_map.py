@@ -109,7 +109,7 @@ class ObjectMap:
         cells = viewpoint_cells(centres, view.T_world_camera[:3, 3])
         self.labels.update(objects, detected, scores, cells)
         self._miss(matched, view, objects)
-        self._cover(matched, objects)
+        self.points.cover(matched.shown, np.append(objects, -1)[matched.covering], objects)
         sightings = Sightings(view.keyframe_id, view.timestamp_s, objects)
         self.points.add(sightings, found.points_camera, objects[found.owners])
         self.points.thin(self.config.max_points)
@@ -223,13 +223,6 @@ class ObjectMap:
         T = view.T_world_camera
         cells = viewpoint_cells(transform(T, centres), T[:3, 3])
         self.labels.miss(ids, expected.astype(np.float32), cells)
-
-    def _cover(self, matched: _Association, objects: Ints) -> None:
-        """Count which points of the objects (D,) that are detected the masks of these cover."""
-        owners = self.points.owners(matched.shown)
-        on = np.append(objects, -1)[matched.covering]
-        detected = np.isin(owners, objects)
-        self.points.cover(matched.shown[detected], (on == owners)[detected])
 
     def _revise(self, matched: _Association, found: Detections, objects: Ints) -> Ints:
         """Merge and split objects with enough evidence; the objects (D,) of the detections then."""

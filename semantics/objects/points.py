@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
 from bmask_slam.graph.geometry import transform
 
 _GOLDEN = 0.6180339887
@@ -53,9 +53,14 @@ class ObjectPoints:
         self._owners = np.append(self._owners, owners)
         self._covered = np.concatenate([self._covered, np.ones((len(points), 2), np.int64)])
 
-    def cover(self, rows: Ints, covered: Mask) -> None:
-        """Count a view that shows rows of points (N,); does its mask of their object cover them?"""
-        self._covered[rows] += np.stack([covered, np.ones(len(rows), bool)], axis=1)
+    def cover(self, rows: Ints, under: Ints, detected: Ints) -> None:
+        """Count a view that shows rows of points (N,), each under the mask of an object (N,) or -1.
+
+        It has masks of the objects ``detected`` (D,); only points of these count.
+        """
+        owners = self._owners[rows]
+        counts = np.isin(owners, detected)
+        self._covered[rows[counts]] += np.stack([under == owners, counts], axis=1)[counts]
 
     def covered_shares(self, poses: dict[int, Array]) -> Array:
         """Of the views that show a point and its object, the share whose mask of it covers it.
@@ -64,10 +69,6 @@ class ObjectPoints:
         """
         under, views = self._covered[self.rows(poses)].T
         return np.asarray(under / views)
-
-    def owners(self, rows: Ints) -> Ints:
-        """The objects (N,) of rows of points (N,)."""
-        return self._owners[rows]
 
     def in_world(self, poses: dict[int, Array]) -> tuple[Ints, Array]:
         """Objects (N,) and world points (N, 3) of the rows whose keyframe has a pose."""
