@@ -172,7 +172,8 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
         title=source.name,
         dense=arguments.map,
         calibrate=arguments.calibrate,
-        interpolates=source.use is not None,
+        straightens=True,
+        interpolates=source.interpolates,
     )
 
 

@@ -87,7 +87,7 @@ def _track(slam: LiveSlam, source: Source, frame: Frame, prepared: Prepared) -> 
     """Track a frame; the source goes on with the camera that may have been found meanwhile."""
     camera, images = slam.camera, (frame.rgb, frame.depth_m)
     result = slam.track(frame.timestamp_s, *images, prepared, frame.name, frame.depth_lag_s)
-    if slam.camera != camera and source.use is not None:
+    if slam.camera != camera:
         source.use(slam.camera)
     return result
 

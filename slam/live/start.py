@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bmask_slam.calibration.adoption import CALIBRATE, SelfCalibrationConfig
+from bmask_slam.calibration.adoption import BENDS, CALIBRATE, SelfCalibrationConfig
+from bmask_slam.graph.calibration.model import SHUTTER, TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
@@ -44,8 +45,10 @@ class LiveOptions:
         dense: make a dense map as well; needs ``out``.
         calibrate: whether readout time, depth delay and bend of depth are found while it runs:
             ``auto`` uses what is found, ``report`` only says so, ``off``.
-        interpolates: whether the source gives depth at the colour image's time and straightened,
-            also by a camera that is found; if not, only a readout time that is found is used.
+        straightens: whether the source straightens depth by `LiveSlam.camera`, also one that is
+            found; if not, a bend of depth that is found is not used.
+        interpolates: whether it gives depth at the colour image's time by that camera; if not, a
+            delay of depth that is found is not used.
     """
 
     out: Path | None = None
@@ -56,6 +59,7 @@ class LiveOptions:
     title: str = "live"
     dense: bool = False
     calibrate: str = "off"
+    straightens: bool = False
     interpolates: bool = False
 
     def __post_init__(self) -> None:
@@ -72,8 +76,13 @@ def start_calibration(
     camera: Camera, config: SystemConfig, options: LiveOptions
 ) -> RemoteCalibration:
     """The process that estimates the camera."""
+    free: list[int] = [SHUTTER]
+    if options.interpolates:
+        free.append(TIME)
+    if options.straightens:
+        free.extend(BENDS)
     rules = SelfCalibrationConfig()
-    setup = CalibrationSetup(camera, config.graph, rules, options.calibrate, options.interpolates)
+    setup = CalibrationSetup(camera, config.graph, rules, options.calibrate, tuple(free))
     return RemoteCalibration(setup)
 
 

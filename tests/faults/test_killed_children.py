@@ -53,6 +53,7 @@ def test_every_tracked_pose_is_saved(slow_office: Path, tmp_path: Path, seed: in
         images=slow_office,
         dense=has_dense(seed),
         calibrate="report",
+        straightens=True,
         interpolates=True,
     )
     with LiveSlam(sequence.camera, CONFIG, options) as slam:

@@ -25,7 +25,6 @@ from bmask_slam.calibration.motion import twists_at
 from bmask_slam.calibration.rematching import estimate_again
 from bmask_slam.calibration.views import sensor_sigmas
 from bmask_slam.graph.arrays import Array, Ints
-from bmask_slam.graph.calibration.model import SHUTTER
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
@@ -55,14 +54,15 @@ class CalibrationSetup:
         graph: settings of the graph.
         config: when something is adopted.
         mode: "auto": what is sure is adopted; "report": it is only said.
-        follows: whether the source's depth follows a camera of another delay or distortion.
+        free: the parameters that may be used, by their places in PARAMETERS: those that the
+            source's frames follow.
     """
 
     camera: Camera
     graph: SmootherConfig
     config: SelfCalibrationConfig
     mode: str
-    follows: bool
+    free: tuple[int, ...]
 
 
 def serve_calibration(channel: Channel, setup: CalibrationSetup) -> None:
@@ -105,8 +105,7 @@ class CalibrationServer:
             estimate = None
         if estimate is not None:
             logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
-            free = FREE if setup.follows else (SHUTTER,)
-            state = judged(self._state, estimate, setup.mode, config, free)
+            state = judged(self._state, estimate, setup.mode, config, setup.free)
         self._state = state
         if state.adopted:
             motions = self._motions(world, paths, run, state.camera)

@@ -9,22 +9,20 @@ from typing import Any
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.sources.message_frames import message_frames
 from bmask_slam.live.sources.pairing import DEPTH, RGB, Pair, Pairer
-from bmask_slam.live.sources.source import SourceCounts, paced
+from bmask_slam.live.sources.source import MeasuredSource, SourceCounts, paced
 from bmask_slam.sequences.bags.bag_file import open_bag
 from bmask_slam.sequences.bags.ros_images import stamp_s
 from bmask_slam.sequences.bags.topics import BagTopics, find_camera, find_topics
 from bmask_slam.sequences.frame import Frame
 
 
-class BagSource:
+class BagSource(MeasuredSource):
     """A recorded bag; colour and depth are paired by the stamps in their headers.
 
     Attributes:
         counts: images that did not become frames so far.
         waits: see ``Source``; False if ``realtime``.
     """
-
-    use = None
 
     def __init__(
         self,
@@ -57,7 +55,7 @@ class BagSource:
 
     def _frames(self) -> Iterator[Frame]:
         names = (self._topics.rgb, self._topics.depth, str(self._path))
-        return message_frames(self._pairs(), self.camera, self._form, self.counts, names)
+        return message_frames(self._pairs(), lambda: self.camera, self._form, self.counts, names)
 
     def _pairs(self) -> Iterator[Pair[Any]]:
         pairer = Pairer[Any](self.counts, self.camera.depth_time_offset_s)

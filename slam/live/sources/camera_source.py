@@ -13,7 +13,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.sources.pairing import RGB, GapMeter, StreamClock
-from bmask_slam.live.sources.source import SourceCounts
+from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
 from bmask_slam.sequences.frame import Frame
 
 RETRY_S = 0.01
@@ -27,7 +27,7 @@ class CameraImages(NamedTuple):
     depth_m: Floats
 
 
-class CameraSource(ABC):
+class CameraSource(MeasuredSource, ABC):
     """Reads a device until it is closed or gives no more frames.
 
     Attributes:
@@ -37,7 +37,6 @@ class CameraSource(ABC):
 
     camera: Camera
     waits = False
-    use = None
 
     def __init__(self, name: str, silence_s: float) -> None:
         self.name = name

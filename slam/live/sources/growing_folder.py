@@ -19,7 +19,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import is_inside
 from bmask_slam.graph.trajectory import Trajectory, check_seconds
 from bmask_slam.live.sources.pairing import DEPTH, RGB, Pairer
-from bmask_slam.live.sources.source import SourceCounts
+from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
 from bmask_slam.sequences.cameras import find_camera
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.sequences.images import read_depth, read_rgb
@@ -91,7 +91,7 @@ class _ListedPair(NamedTuple):
     listed_s: float
 
 
-class GrowingFolder:
+class GrowingFolder(MeasuredSource):
     """A folder in TUM layout that is read from its first line on while it is being written.
 
     It ends when a file ``.finished`` is there and everything is read, or when nothing new comes for
@@ -103,7 +103,6 @@ class GrowingFolder:
     """
 
     waits = False
-    use = None
 
     def __init__(
         self, folder: Path, camera: Path | None = None, options: FollowOptions | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from bmask_slam.graph.camera import Camera
@@ -21,18 +21,20 @@ logger = logging.getLogger(__name__)
 
 def message_frames(
     pairs: Iterator[Pair[Any]],
-    camera: Camera,
+    camera_now: Callable[[], Camera],
     form: DepthForm,
     counts: SourceCounts,
     names: tuple[str, str, str],
 ) -> Iterator[Frame]:
     """A frame of each pair; what cannot be decoded is counted in ``counts.broken`` and skipped.
 
-    ``names`` are those of the colour topic, of the depth topic and of the source, for messages.
+    ``camera_now`` gives the camera to read each frame with; ``names`` are those of colour topic,
+    depth topic and source, for messages.
     """
     index = 0
     for pair in pairs:
         rgb_at, depth_at, source_at = (f"{name} at {pair.stamp_s:.6f}" for name in names)
+        camera = camera_now()
         try:
             rgb = colour_image(pair.rgb, rgb_at).copy()  # messages are read-only
             stored = depth_image(pair.depth, depth_at)

@@ -14,7 +14,7 @@ from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.ros2.dds import LATCHED, SENSOR, STATE, Node, Reader
 from bmask_slam.live.sources.message_frames import message_frames
 from bmask_slam.live.sources.pairing import DEPTH, RGB, Pair, Pairer
-from bmask_slam.live.sources.source import SourceCounts
+from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
 from bmask_slam.sequences.bags.bag_file import INFO_TYPE, Topic
 from bmask_slam.sequences.bags.ros_images import stamp_s
 from bmask_slam.sequences.bags.topics import (
@@ -65,7 +65,7 @@ class _Heard:
         return kept
 
 
-class Ros2Source:
+class Ros2Source(MeasuredSource):
     """Colour and depth images of a ROS 2 domain, paired by the stamps in their headers.
 
     A publisher may stop and start again; the topics are those of a known camera, or given.
@@ -76,7 +76,6 @@ class Ros2Source:
     """
 
     waits = False
-    use = None
 
     def __init__(
         self,
@@ -113,7 +112,7 @@ class Ros2Source:
             InputError: none came for ``silence_s``.
         """
         names = (self._where,) * 3
-        return message_frames(self._pairs(), self.camera, self._form, self.counts, names)
+        return message_frames(self._pairs(), lambda: self.camera, self._form, self.counts, names)
 
     def close(self) -> None:
         """End ``frames`` soon; may be called from any thread."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, dataclass
@@ -63,6 +63,7 @@ class Source(Protocol):
         counts: what was received that did not become a frame.
         waits: True: each frame waits until the consumer asks for it, as in a recording that is
             played as fast as possible. False: frames come at their own rate, as a camera's do.
+        interpolates: whether depth is that at the colour image's time, by the camera's delay.
     """
 
     name: str
@@ -70,13 +71,10 @@ class Source(Protocol):
     groundtruth: Trajectory | None
     counts: SourceCounts
     waits: bool
+    interpolates: bool
 
-    @property
-    def use(self) -> Callable[[Camera], None] | None:
-        """Gives later frames their depth by another camera, from any thread.
-
-        None where depth is not interpolated at the colour image's time.
-        """
+    def use(self, camera: Camera) -> None:
+        """Give later frames their depth by another camera, from any thread."""
 
     def frames(self) -> Iterator[Frame]:
         """Frames in the order of their stamps, each as soon as it is available."""
@@ -85,8 +83,21 @@ class Source(Protocol):
         """End ``frames`` soon, from any thread."""
 
 
+class MeasuredSource:
+    """A source that gives depth as it was measured, straightened by its camera."""
+
+    camera: Camera
+    interpolates = False
+
+    def use(self, camera: Camera) -> None:
+        """Straighten the depth of later frames by another camera, from any thread."""
+        self.camera = camera
+
+
 class RecordedSource:
     """A recorded sequence, at the rate of its stamps if ``realtime``."""
+
+    interpolates = True
 
     def __init__(self, sequence: Sequence, realtime: bool) -> None:
         self.name, self.camera = sequence.name, sequence.camera
@@ -133,7 +144,7 @@ class Limited:
         self.name, self.camera = source.name, source.camera
         self.groundtruth = source.groundtruth
         self.counts, self.waits = source.counts, source.waits
-        self.use = source.use
+        self.use, self.interpolates = source.use, source.interpolates
         self.node = getattr(source, "node", None)  # of ROS 2
         self._source, self._max_frames = source, max_frames
 

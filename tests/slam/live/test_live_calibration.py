@@ -27,7 +27,7 @@ CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
 
 def played(sequence: Sequence, out: Path, calibrate: str) -> LiveSlam:
     source = RecordedSource(sequence, realtime=False)
-    options = LiveOptions(out, calibrate=calibrate, interpolates=True)
+    options = LiveOptions(out, calibrate=calibrate, straightens=True, interpolates=True)
     with LiveSlam(source.camera, CONFIG, options) as slam:
         assert play(slam, source, PlayOptions(realtime=False, quiet=True)) is None
     assert source.camera == slam.camera

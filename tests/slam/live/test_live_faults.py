@@ -27,7 +27,7 @@ from bmask_slam.live.processes import supervision
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.live.recorder import HEALTH_S
-from bmask_slam.live.sources.source import SourceCounts
+from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
@@ -61,13 +61,12 @@ def test_tracking_continues_while_the_disk_is_full(small_disk, caplog) -> None:
     assert not running(pids)
 
 
-class Camera:
+class Camera(MeasuredSource):
     """A camera that is unplugged after some frames."""
 
     name = "camera"
     camera = CAMERA
     waits = False
-    use = None
     groundtruth = None
 
     def __init__(self, frames: int) -> None:

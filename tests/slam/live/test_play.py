@@ -19,7 +19,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.live.live_slam import LiveSlam
 from bmask_slam.live.play import WAITING, PlayOptions, play
-from bmask_slam.live.sources.source import Newest, paced
+from bmask_slam.live.sources.source import MeasuredSource, Newest, paced
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
@@ -28,10 +28,10 @@ POSES = [se3_exp(np.array([0, 0, 0, 0.02 * k, 0, 0])) for k in range(10)]
 FRAMES = PlaneViews(POSES)
 
 
-class FakeSource:
+class FakeSource(MeasuredSource):
     """A source that gives these frames."""
 
-    name, camera, groundtruth, use = "given", CAMERA, None, None
+    name, camera, groundtruth = "given", CAMERA, None
 
     def __init__(self, frames: list[Frame]) -> None:
         self._frames = frames

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,20 @@ def test_frames_are_read_from_every_bag_format(tmp_path: Path, name: str, storag
     assert (camera.width, camera.height, camera.depth_scale) == (160, 120, 1.0)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (131.25, 130.0, 79.625, 60.375)
     assert camera.distortion == (0.1, -0.2, 0.001, 0.002, 0.05)
+
+
+def test_depth_of_later_frames_is_straightened_by_a_camera_that_was_found(tmp_path: Path) -> None:
+    source = BagSource(write_bag(tmp_path / "a.bag"))
+    frames = source.frames()
+    assert_same([next(frames)], [0])
+    bent = replace(source.camera, depth_distortion=(0.01, -0.02, 0.03, 0.0, 0.01))
+    source.use(bent)
+    pixels = np.stack(np.meshgrid(np.arange(160.0), np.arange(120.0)), axis=-1)
+    for index, frame in enumerate(frames, start=1):
+        bend = 1 / view(index).depth_m - 1 / frame.depth_m
+        measured = np.isfinite(bend)
+        np.testing.assert_allclose(bend[measured], bent.depth_bend(pixels)[measured], atol=1e-6)
+        assert measured.mean() > 0.5
 
 
 def test_realtime_gives_frames_at_the_recorded_rate(tmp_path: Path) -> None:
