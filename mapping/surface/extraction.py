@@ -22,7 +22,7 @@ EDGES = [(a, b) for a, b in combinations(range(8), 2) if np.abs(CORNERS[a] - COR
 AT_ONCE = 1000
 MIN_WITNESSES, MAX_FREE_SHARE = 1.0, 0.5
 """A surface needs so many frames that saw it, and at most this share of them saw through it."""
-MAX_STEP_VOXELS = 3.0
+MAX_STEP_VOXELS = 6.0
 """Distances in a cell differ by less: else it is not a surface that a frame saw, but the limit
 between what is behind one and what another frame saw as free beside it."""
 MIN_COMPONENT_M2 = 0.02
