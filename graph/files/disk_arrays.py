@@ -142,7 +142,7 @@ class DiskRecords:
             return place
         if self._file is None:
             self._file = _File()
-        if self._chunk is None or self._end + size > self._file.size:
+        if self._chunk is None or self._end + size > self._chunk[0] + len(self._chunk[1]):
             start = self._end
             self._file.grow(start + max(size, CHUNK, start // 2 // PAGE * PAGE))
             self._chunk = start, self._file.map(start)

@@ -199,10 +199,15 @@ class ObjectPoints:
         }
 
     def restore(self, state: Arrays) -> None:
-        """Replace the content by a state; those of older versions do not say what covers points."""
+        """Replace the content by a state; those of older versions do not say what covers points.
+
+        Raises ValueError.
+        """
         self._next_id = int(state["next_id"])
         self._points, self._anchors = state["points"], state["anchors"]
         self._owners, self._sightings = state["owners"], state["sightings"]
         unknown = np.ones((len(self._owners), 2), np.int64)
         self._covered = state.get("covered", unknown).reshape(-1, 2).copy()
+        if self._covered.shape != unknown.shape or (self._covered[:, 1] < 1).any():
+            raise ValueError("not how many views show each point of an object")
         self._seen_s, self._landmarks = state["seen_s"], state["landmarks"]

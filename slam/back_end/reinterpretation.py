@@ -64,6 +64,7 @@ def reinterpret(keyframe: Keyframe, motion: KeyframeMotion, old: Camera, new: Ca
     share = depth_m[rows] * change
     usable = np.abs(share) < MAX_CHANGE  # False for NaN
     depth_m[rows[usable]] /= 1 + share[usable]
+    depth_m[~((depth_m > 0) & (depth_m < np.inf))] = np.nan  # bent beyond infinity
     raw = replace(
         features,
         pixels=new.undistort(pixels),

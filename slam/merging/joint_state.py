@@ -161,6 +161,9 @@ def joint_state(states: Sequence[Arrays], shifts: Sequence[Shift], empty: Arrays
     if labelled:
         those = [states[k] for k in labelled]
         for name in (n for n in those[0] if n.startswith("semantics.")):
+            if not all(name in state for state in those):  # of an older version
+                found.pop(name, None)
+                continue
             found[name] = _joined(name, those, [shifts[k] for k in labelled])
     found |= _graph(states, shifts) | _sensors(states, shifts)
     return found

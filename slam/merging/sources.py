@@ -57,7 +57,7 @@ class Source:
     def labels(self) -> tuple[list[str], ...]:
         """The names of the labels of things, how they were measured, and those of surfaces."""
         names = ("names", "measured", "surfaces.names")
-        return tuple(self.state[f"semantics.{name}"].tolist() for name in names)
+        return tuple(self.state.get(f"semantics.{name}", np.array([""])).tolist() for name in names)
 
     def frame_rows(self) -> Iterator[dict[str, object]]:
         """The lines of frames.csv, as they are in the merged run's."""

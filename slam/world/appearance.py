@@ -34,9 +34,12 @@ class Appearance:
     """
 
     def __init__(self, column: NDArray | DiskRows, row: Ints) -> None:
-        self._disk = column if isinstance(column, DiskRows) else None
-        self._rows = column.rows if isinstance(column, DiskRows) else column
-        self._row_of = row
+        self._column, self._row_of = column, row
+
+    @property
+    def _rows(self) -> NDArray:
+        column = self._column
+        return column.rows if isinstance(column, DiskRows) else column
 
     def __len__(self) -> int:
         return len(self._row_of)
@@ -45,15 +48,15 @@ class Appearance:
         return self._rows[self._row_of[ids]]
 
     def __setitem__(self, ids: Any, values: Any) -> None:
-        if self._disk is not None:
+        column = self._column
+        if isinstance(column, DiskRows):
             at = np.atleast_1d(self._row_of[ids])
-            values = np.broadcast_to(values, (len(at), *self._rows.shape[1:]))
-            self._disk.write(at[at > 0], values[at > 0])
-            self._rows = self._disk.rows
+            values = np.broadcast_to(values, (len(at), *column.rows.shape[1:]))
+            column.write(at[at > 0], values[at > 0])
             return
-        placeholder = self._rows[0].copy()
-        self._rows[self._row_of[ids]] = values
-        self._rows[0] = placeholder
+        placeholder = column[0].copy()
+        column[self._row_of[ids]] = values
+        column[0] = placeholder
 
     def pick(self, ids: Ints, which: Ints) -> NDArray:
         """Entry which[k] of the row of ids[k]."""

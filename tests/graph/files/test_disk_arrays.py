@@ -51,6 +51,21 @@ def test_stored_arrays_are_equal_and_read_only() -> None:
         stored[1]["pixels"][0] = 1.0
 
 
+def test_arrays_are_stored_again_after_a_map_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    records, given = DiskRecords(), arrays(9)
+    records.stored(given)
+
+    def none_left(*_: Any) -> None:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(disk_arrays._File, "map", none_left)
+        records.stored({"a": np.ones(2_000_000)})
+    large = {"a": np.full(1_200_000, 2.0)}
+    assert same(records.stored(large), large)
+    assert same(records.stored(given), given)
+
+
 def test_memory_does_not_grow_with_what_is_stored() -> None:
     records, kept = DiskRecords(), []
     kept.append(records.stored({"a": np.zeros(100_000)}))

@@ -200,6 +200,19 @@ def test_what_few_masks_show_beside_a_thing_is_not_in_its_box() -> None:
     assert old.box.size_m[:2].max() > 0.6
 
 
+def test_a_count_of_views_that_is_not_of_the_points_is_refused() -> None:
+    points = ObjectPoints()
+    new = int(points.new_ids(1)[0])
+    points.add(Sightings(0, 0.0, np.array([new])), np.ones((3, 3)), np.full(3, new))
+    state = points.state()
+    for covered in (np.ones(4, np.int64), np.zeros(6, np.int64)):
+        with pytest.raises(ValueError, match="not how many views"):
+            ObjectPoints().restore({**state, "covered": covered})
+    older = ObjectPoints()
+    older.restore({name: array for name, array in state.items() if name != "covered"})
+    assert older.covered_shares({0: np.eye(4)}).tolist() == [1.0, 1.0, 1.0]
+
+
 def test_a_desk_under_two_things_is_no_evidence_that_they_are_one() -> None:
     in_view, alike = np.array([40, 40]), np.tile([0.0, 1.0], (2, 1))
     config, unassigned = RevisionConfig(), np.array([-1])

@@ -1,5 +1,8 @@
 """The landmark table: growth, ids, and landmarks that move with their host keyframes."""
 
+import errno
+import os
+
 import numpy as np
 import pytest
 
@@ -41,6 +44,23 @@ def test_defaults_of_a_new_landmark() -> None:
     assert (table.host == 7).all()
     assert (table.last_keyframe == -1).all()
     assert np.isnan(table.patch_views).all()  # it has no patch yet
+
+
+def test_patches_are_those_in_memory_once_the_disk_is_full(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    table = LandmarkTable()
+    ids = table.add(columns(3))
+    table.patches[ids] = np.full((3, 4, 17, 17), 7, np.uint8)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "pwrite", full)
+    table.remove(ids[:2])
+    again = table.add(columns(2))
+    assert table.patches[again].max() == 0
+    assert table.patches[ids[2]].min() == 7
 
 
 def test_attributes_write_through_to_the_table() -> None:
