@@ -42,6 +42,7 @@ def use_camera(mapper: Mapper, camera: Camera, motions: Mapping[int, KeyframeMot
     keyframes = mapper.world.keyframes
     for number in sorted(motions.keys() & keyframes.keys()):
         reinterpret(keyframes[number], motions[number], mapper.camera, camera)
+        mapper.world.store_features(keyframes[number])
     mapper.camera = camera
     observations = sent_observations(mapper.world, camera.graph_depth_factor)
     estimate = mapper.smoother.remeasure(camera, observations)
