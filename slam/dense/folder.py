@@ -24,7 +24,8 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ import cv2
 import numpy as np
 
 from bmask_slam.dense.options import MapOptions, fusion_config
-from bmask_slam.graph.arrays import Arrays, Image, Mask
+from bmask_slam.graph.arrays import Arrays, Image, Ints, Mask
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, check_like, read_arrays, write_arrays
 from bmask_slam.graph.files.file_names import refuse_link
@@ -57,6 +58,7 @@ LABEL_FILE = FileKind("keyframe labels", 2, compressed=True)
 _NO_EVIDENCE = InstanceEvidence(
     np.zeros((0, 0), np.float32), np.zeros(0, np.int64), np.zeros(0, np.uint16)
 )
+NewIds = Callable[[Ints], Ints]
 PARTS = ("depth", "colours", "moving", "labels")
 OLD_PARTS = ("submaps", "volume")
 METHOD = 4
@@ -138,6 +140,38 @@ class DenseFolder:
         if not path.is_file():
             raise InputError(f"{path}: no dense map here; make it with bmask-slam map {run}")
         return cls(run, _read_settings(path))
+
+    @classmethod
+    def reading(cls, run: Path) -> DenseFolder:
+        """The dense map of a run, of which nothing is changed. Raises InputError as ``open``."""
+        found = cls.__new__(cls)
+        found.path = run / "dense"
+        found.settings = _read_settings(found.path / "settings.json")
+        return found
+
+    def is_like(self, other: DenseFolder) -> bool:
+        """Whether their keyframes were made in the same way, of whatever run."""
+        mine, theirs = (json.loads(json.dumps(f.settings | {"run": ""})) for f in (self, other))
+        return bool(mine == theirs)
+
+    def take_over(
+        self, other: DenseFolder, keyframe_ids: Mapping[int, int], new_landmarks: NewIds
+    ) -> int:
+        """Copy the finished keyframes of another folder; how many there were.
+
+        ``keyframe_ids`` are their new ids by the old ones, ``new_landmarks`` gives those of
+        landmarks. Raises InputError if they cannot be read or written.
+        """
+        done = [(old, new) for old, new in keyframe_ids.items() if other.is_done(old)]
+        for old, new in done:
+            evidence = other.evidence(old)
+            evidence = replace(evidence, landmark_ids=new_landmarks(evidence.landmark_ids))
+            if (excluded := other.excluded(old)) is not None:
+                self.write_excluded(replace(excluded, anchor=new))
+            shutil.copyfile(other._image(old), self._image(new))
+            shutil.copyfile(other._file("depth", old), self._file("depth", new))
+            _write_evidence(self._file("labels", new), evidence)
+        return len(done)
 
     def _clear_unless(self, settings: dict[str, Any]) -> None:
         """Remove the keyframes unless they were made with these settings."""

@@ -22,7 +22,7 @@ from bmask_slam.merging.joining import Step, join, join_objects
 from bmask_slam.merging.joint_state import joint_state
 from bmask_slam.merging.report import MergeSummary, PairSearch, line_of, no_place, rows_of
 from bmask_slam.merging.sources import Source, read_sources
-from bmask_slam.run_folder.folder import RunFolder
+from bmask_slam.run_folder.folder import DENSE, RunFolder
 from bmask_slam.run_folder.frame_file import FRAMES
 from bmask_slam.run_folder.map_file import MAP
 from bmask_slam.run_folder.metrics import row, save
@@ -79,6 +79,10 @@ def merge_runs(options: MergeOptions) -> MergeSummary:
         rows = rows_of(system, sources, found, joined)
         rows.append(row("merge_objects_fused", twice, "objects"))
         _write(folder, system, sources, rows)
+        if any((source.path / DENSE).is_dir() for source in sources):
+            from bmask_slam.merging.dense_maps import merge_dense_maps  # noqa: PLC0415 - torch
+
+            merge_dense_maps(folder.path, sources, system.map.world.landmarks)
         folder.complete()
         return MergeSummary(folder.path, rows, lines)
 

@@ -409,3 +409,19 @@ def test_a_pixel_of_an_instance_that_is_not_there_is_refused(tmp_path: Path) -> 
     write_arrays(folder.path / "labels" / "000007", LABEL_FILE, {}, arrays)
     with pytest.raises(InputError, match="labels/000007: a pixel of an instance"):
         folder.evidence(7)
+
+
+def test_keyframes_of_another_dense_map_are_taken_over(mapped: Path, tmp_path: Path) -> None:
+    part = DenseFolder.reading(mapped)
+    folder = DenseFolder(tmp_path, part.settings | {"run": "another"})
+    assert folder.is_like(part)
+    (tmp_path / "b").mkdir()
+    assert not DenseFolder(tmp_path / "b", part.settings | {"voxel_m": 0.5}).is_like(part)
+    assert folder.take_over(part, {0: 20, 1: 21, 99: 119}, lambda ids: ids + 1000) == 2
+    assert [folder.is_done(k) for k in (20, 21, 119, 0)] == [True, True, False, False]
+    before, after = part.evidence(1), folder.evidence(21)
+    assert len(before.landmark_ids) > 0
+    assert (after.landmark_ids == before.landmark_ids + 1000).all()
+    assert (after.log_likelihoods == before.log_likelihoods).all()
+    np.testing.assert_array_equal(folder.fused(21).rho, part.fused(1).rho)  # NaN where missing
+    assert (folder.colours(20) == part.colours(0)).all()
