@@ -96,8 +96,8 @@ def main() -> None:
             apply_delta(maker.delta(world, system.mapper.history), copy, history)
         if (index + 1) % max(frames // ROWS, 1) == 0:
             sizes = {name: sum(array_bytes(part).values()) / 1e6 for name, part in parts.items()}
-            table.append((len(world.keyframes), int(world.landmarks.in_map.sum()), settled_mb()))
-            table[-1] += tuple(sizes.values())
+            counts = len(world.keyframes), int(world.landmarks.in_map.sum())
+            table.append([*counts, settled_mb(), *sizes.values()])
     titles = ("keyframes", "landmarks", "RssAnon MB", *(f"{name} MB" for name in parts))
     print("".join(f"{title:>12}" for title in titles))
     for row in table:

@@ -22,7 +22,7 @@ from bmask_slam.graph.trajectory import Trajectory, nearest_indices
 from bmask_slam.live.health import Health
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.play import PlayOptions, play
-from bmask_slam.live.sources.source import SourceCounts
+from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.sequences import Sequence, open_sequence
 from bmask_slam.sequences.frame import Frame
@@ -37,12 +37,11 @@ def own_mb(pid: int | str) -> float:
     return next(float(line.split()[1]) for line in lines if line.startswith("RssAnon")) / 1024
 
 
-class Tour:
+class Tour(MeasuredSource):
     """A sequence played forward and backward, as a source that waits for the loop."""
 
     name = "tour"
     waits = True
-    use = None
 
     def __init__(self, sequence: Sequence, frames: int, hz: float, watch: Callable[[int], None]):
         self.camera = sequence.camera

@@ -26,7 +26,7 @@ from benchmarks.live.session import PARTS, own_mb
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.play import PlayOptions, play
-from bmask_slam.live.sources.source import SourceCounts, paced
+from bmask_slam.live.sources.source import MeasuredSource, SourceCounts, paced
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.sequences import Sequence, open_sequence
 from bmask_slam.sequences.frame import Frame
@@ -62,12 +62,11 @@ PANELS = (
 )
 
 
-class Rounds:
+class Rounds(MeasuredSource):
     """Sequences that are played forward and backward again and again, at the rate of a camera."""
 
     name = "rounds"
     waits = False
-    use = None
 
     def __init__(
         self, sequences: list[Sequence], frames: int, hz: float, watch: Callable[[], None]

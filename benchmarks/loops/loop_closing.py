@@ -41,8 +41,10 @@ class WrongLoops:
         self.let_in, self.count = let_in, 0
         closer.propose, closer.confirm = self.propose, self.confirm  # type: ignore[method-assign]
 
-    def propose(self, keyframe: Keyframe, world: WorldMap) -> list[LoopConstraint]:
-        right = self._propose(keyframe, world)
+    def propose(
+        self, keyframe: Keyframe, world: WorldMap, elsewhere: bool = False
+    ) -> list[LoopConstraint]:
+        right = self._propose(keyframe, world, elsewhere)
         old = [k for k in world.keyframes if k < keyframe.id - 10]
         noise = np.repeat([TURN_RAD, SHIFT_M], 3)
         self._wrong = [
@@ -68,8 +70,8 @@ def state_before_loops(system: SlamSystem, sequence: Sequence) -> tuple[Arrays, 
     closer = system.mapper.loops
     propose = closer.propose
 
-    def spy(keyframe: Keyframe, world: WorldMap) -> list[LoopConstraint]:
-        proposed.extend(propose(keyframe, world))
+    def spy(keyframe: Keyframe, world: WorldMap, elsewhere: bool = False) -> list[LoopConstraint]:
+        proposed.extend(propose(keyframe, world, elsewhere))
         return proposed
 
     closer.propose = spy  # type: ignore[method-assign]
