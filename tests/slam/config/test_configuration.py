@@ -229,6 +229,7 @@ def test_an_older_file_is_read_with_the_present_names_of_its_settings(tmp_path: 
     other_defaults = {
         "semantics.segmenter.min_score",
         "semantics.object_score",
+        "semantics.objects.association.max_cost",
         "features.thresholds",
     }
     assert set(differing) <= {set_by_conftest, of_the_camera_now, *other_defaults}
