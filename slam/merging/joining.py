@@ -120,12 +120,15 @@ def join(system: SlamSystem, tree: Sequence[Step], others: Sequence[CommonPlaces
 def join_objects(system: SlamSystem, begins: Sequence[int]) -> int:
     """Make the objects that several runs saw one each; the ids of run k begin at ``begins[k]``.
 
-    Returns how many were there twice.
+    Returns how many were there twice. Map segments have world frames of their own.
     """
     system.semantics.follow_map()
-    poses = {k.id: k.T_world_camera for k in system.map.world.keyframes.values()}
     objects, ends = system.semantics.objects, (*begins[2:], np.iinfo(np.int64).max)
-    return sum(objects.join(poses, a, b) for a, b in zip(begins[1:], ends, strict=True))
+    keyframes, twice = system.map.world.keyframes.values(), 0
+    for segment in sorted({k.segment for k in keyframes}):
+        poses = {k.id: k.T_world_camera for k in keyframes if k.segment == segment}
+        twice += sum(objects.join(poses, a, b) for a, b in zip(begins[1:], ends, strict=True))
+    return twice
 
 
 def _move(world: WorldMap, tree: Sequence[Step]) -> None:

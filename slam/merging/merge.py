@@ -21,7 +21,7 @@ from bmask_slam.merging.common_places import CommonPlaces, MergeConfig, PlaceSea
 from bmask_slam.merging.joining import Step, join, join_objects
 from bmask_slam.merging.joint_state import joint_state
 from bmask_slam.merging.report import MergeSummary, PairSearch, line_of, no_place, rows_of
-from bmask_slam.merging.sources import Source, read_sources
+from bmask_slam.merging.sources import SLACK_S, Source, read_sources
 from bmask_slam.run_folder.folder import DENSE, RunFolder
 from bmask_slam.run_folder.frame_file import FRAMES
 from bmask_slam.run_folder.map_file import MAP
@@ -33,7 +33,6 @@ from bmask_slam.system import SlamSystem
 logger = logging.getLogger(__name__)
 
 TRAJECTORY_OF_RUN = "trajectory_run_{}.txt"
-SLACK_S = 1e-4
 
 
 @dataclass(frozen=True)

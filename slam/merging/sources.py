@@ -27,6 +27,9 @@ from bmask_slam.system_results import checked_state
 
 GAP_S = 10.0
 """At least so long after the last frame of one run the next one begins, if it has to be moved."""
+SLACK_S = 1e-4
+"""Stamps in files have six decimals."""
+MAX_STAMP_S, MAX_INDEX = 1e11, 2**40
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +126,7 @@ def _read_source(path: Path, before: Source | None) -> Source:
     config = resolve(SystemConfig, path / CONFIG if (path / CONFIG).is_file() else None)
     state = checked_state(state, SlamSystem(camera, config).state(), path / MAP)
     state = _without_foreign_stamps(state)
-    frames = read_frames(path / FRAMES)
-    if not len(frames):
-        raise InputError(f"{path / FRAMES}: holds no frame; run the sequence again")
+    frames = _frames_of(path / FRAMES, state)
     source = Source(path, state, camera, config, frames, Shift())
     if before is None:
         return source
@@ -135,6 +136,21 @@ def _read_source(path: Path, before: Source | None) -> Source:
     indices = before.frames.index.max() + before.shift.frames + 1
     shift = before.shift.after(before.state, int(indices - frames.index[0]), shift_s)
     return replace(source, shift=shift)
+
+
+def _frames_of(path: Path, state: Arrays) -> FrameTable:
+    """The frames of a run with a state. Raises InputError where they are not the map's."""
+    frames, map_s = read_frames(path), state["mapper.history.timestamps_s"]
+    if not len(frames):
+        raise InputError(f"{path}: holds no frame; run the sequence again")
+    stamps_s, index = frames.timestamps_s, frames.index
+    rising = (np.diff(stamps_s) >= 0).all() and (np.diff(index) > 0).all()
+    known = bool(rising) and bool((np.abs(stamps_s) < MAX_STAMP_S).all())
+    known = known and index[0] >= 0 and index[-1] < MAX_INDEX
+    inside = (map_s > stamps_s[0] - SLACK_S) & (map_s < stamps_s[-1] + SLACK_S)
+    if not (known and inside.all()):
+        raise InputError(f"{path}: its stamps or indices are not those of the map; run again")
+    return frames
 
 
 def _check_alike(first: Source, other: Source) -> None:

@@ -7,6 +7,8 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from bmask_slam.evaluation import plot
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.merging.joining import join_objects
 from bmask_slam.merging.merge import MergeOptions, merge_runs
 from bmask_slam.merging.report import MergeSummary
 from bmask_slam.run_folder import metrics
@@ -84,6 +87,25 @@ def test_what_both_saw_is_there_once(merged: MergeSummary, runs: Path) -> None:
     assert values["merge_loop_rms_m"].value < 0.01
 
 
+def test_objects_of_map_segments_that_are_not_joined_stay_apart() -> None:
+    seen: list[tuple[list[int], int]] = []
+    world = SimpleNamespace(
+        keyframes={
+            k: SimpleNamespace(id=k, segment=segment, T_world_camera=np.eye(4))
+            for k, segment in enumerate((0, 2, 0))
+        }
+    )
+
+    def join(poses: dict[int, Any], first: int, _end: int) -> int:
+        seen.append((sorted(poses), first))
+        return 1
+
+    semantics = SimpleNamespace(objects=SimpleNamespace(join=join), follow_map=lambda: None)
+    system: Any = SimpleNamespace(semantics=semantics, map=SimpleNamespace(world=world))
+    assert join_objects(system, [0, 7]) == 2
+    assert seen == [([0, 2], 7), ([1], 7)]
+
+
 def test_the_result_is_one_run(merged: MergeSummary, runs: Path) -> None:
     run = Run(merged.folder)
     first, second = (Run(runs / name) for name in ("first", "second"))
@@ -137,6 +159,20 @@ def test_what_cannot_be_merged_is_refused(
         assert text in error
         assert error.count("\n") == 1
     assert cli.main(["merge", str(runs / "first"), str(other), "--out", str(other)]) == 1
+
+
+def test_frames_that_are_not_the_maps_are_refused(runs: Path, tmp_path: Path) -> None:
+    header, *rows = (runs / "second" / "frames.csv").read_text().splitlines()
+    assert rows[4].startswith("4,0.133333,")
+    broken = shutil.copytree(runs / "second", tmp_path / "broken")
+    for row in ("4,nan,", "4,,", ",0.133333,", "4,9.0,", "0,0.133333,"):
+        wrong = [*rows[:4], row + rows[4].split(",", 2)[2], *rows[5:]]
+        (broken / "frames.csv").write_text("\n".join([header, *wrong, ""]))
+        with pytest.raises(InputError, match="not those of the map"):
+            merge_runs(MergeOptions((runs / "first", broken), tmp_path / "out"))
+    (broken / "frames.csv").write_text("\n".join([header, *rows[4:], ""]))
+    with pytest.raises(InputError, match="not those of the map"):
+        merge_runs(MergeOptions((runs / "first", broken), tmp_path / "out"))
 
 
 def test_recordings_are_listed_where_they_are_known(merged: MergeSummary) -> None:
