@@ -29,7 +29,7 @@ def draw_objects(
     """Draw the map along ``up_world``, in metres, and write the picture.
 
     Every object has a colour of its own, for its box, its landmarks and its name, which is the
-    label and the id; the legend lists the surest with probability and size. Small ones are drawn
+    label and the id; the legend lists the largest with probability and size. Small ones are drawn
     last.
     """
     from matplotlib.collections import LineCollection  # noqa: PLC0415 - loads slowly
@@ -41,8 +41,6 @@ def draw_objects(
     flat = (cloud.points_world @ R_upright_world.T)[:, :2]
     axes.scatter(flat[:, 0], flat[:, 1], s=1.5, c=UNKNOWN_COLOUR, linewidths=0)
     ordered = sorted(found.objects, key=lambda o: -o.box.volume_m3)
-    surest = sorted(found.objects, key=lambda o: -o.distribution[o.label])
-    listed = {o.id for o in surest[:LISTED]}
     for number, o in enumerate(ordered):
         colour = distinct_colour(number)
         own = np.isin(cloud.ids, o.landmark_ids)
@@ -56,10 +54,10 @@ def draw_objects(
         long_m, short_m = np.sort(o.box.size_m[:2])[::-1]
         size = f"{long_m:.2f} x {short_m:.2f} x {o.box.size_m[2]:.2f} m"
         text = f"{name}: {o.distribution[o.label]:.2f}, {size}"
-        if o.id in listed:
+        if number < LISTED:
             axes.plot([], [], "s", ms=6, color=colour, label=text)
-    if len(surest) > LISTED:
-        axes.plot([], [], " ", label=f"and {len(surest) - LISTED} less sure ones: see objects.json")
+    if len(ordered) > LISTED:
+        axes.plot([], [], " ", label=f"and {len(ordered) - LISTED} smaller ones: see objects.json")
     path_points = trajectory.positions_world @ R_upright_world.T
     axes.plot(*path_points[:, :2].T, color="black", lw=0.9, label="camera")
     axes.set_aspect("equal", adjustable="datalim")
