@@ -62,16 +62,16 @@ def merge_runs(options: MergeOptions) -> MergeSummary:
     if options.out.resolve() in [path.resolve() for path in options.runs]:
         raise InputError(f"{options.out}: is an input, which stays as it is; choose another --out")
     sources = read_sources(options.runs)
+    system = _system(sources)
+    _report_frame(system, sources)
+    found = _common_places(system, sources, options.config)
+    lines = tuple(line_of(pair, sources, options.config) for pair in found)
+    tree, others = _plan(system, sources, found, options.config)  # refused before OUT is touched
     with RunFolder(options.out, options.overwrite) as folder:
         logger.info("merged: %s", shlex.join(sys.argv))
-        system = _system(sources)
-        _begin(folder, sources)
-        _report_frame(system, sources)
-        found = _common_places(system, sources, options.config)
-        lines = tuple(line_of(pair, sources, options.config) for pair in found)
         for line in lines:
             logger.info("%s", line)
-        tree, others = _plan(system, sources, found, options.config)
+        _begin(folder, sources)
         joined = join(system, tree, others)
         folder.write_events(system.events.take())
         twice = join_objects(system, [source.shift.objects for source in sources])

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import colorsys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud, MapObjects
 from bmask_slam.semantics.objects.boxes3d import EDGES, gravity_axes
+from bmask_slam.semantics.objects.publication import MapObject
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 UNKNOWN_COLOUR = "#c9c9c4"
 LISTED = 45
@@ -32,8 +38,7 @@ def draw_objects(
     label and the id; the legend lists the largest with probability and size. Small ones are drawn
     last.
     """
-    from matplotlib.collections import LineCollection  # noqa: PLC0415 - loads slowly
-    from matplotlib.figure import Figure  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415 - loads slowly
 
     R_upright_world = gravity_axes(found.up_world).T
     figure = Figure(figsize=(13, 9), dpi=110, layout="constrained")
@@ -42,20 +47,11 @@ def draw_objects(
     axes.scatter(flat[:, 0], flat[:, 1], s=1.5, c=UNKNOWN_COLOUR, linewidths=0)
     ordered = sorted(found.objects, key=lambda o: -o.box.volume_m3)
     for number, o in enumerate(ordered):
-        colour = distinct_colour(number)
-        own = np.isin(cloud.ids, o.landmark_ids)
-        axes.scatter(flat[own, 0], flat[own, 1], s=5, color=colour, linewidths=0)
+        own = flat[np.isin(cloud.ids, o.landmark_ids)]
         corners = (o.box.corners_world @ R_upright_world.T)[:, :2]
-        axes.add_collection(LineCollection(list(corners[EDGES]), colors=[colour], linewidths=1.6))
-        name = f"{found.names.map_name(o.label)} {o.id}"
-        place = corners.mean(axis=0)
-        box = {"facecolor": "white", "alpha": 0.7, "pad": 0.8, "linewidth": 0}
-        axes.annotate(name, place, fontsize=9, ha="center", va="center", color=colour, bbox=box)
-        long_m, short_m = np.sort(o.box.size_m[:2])[::-1]
-        size = f"{long_m:.2f} x {short_m:.2f} x {o.box.size_m[2]:.2f} m"
-        text = f"{name}: {o.distribution[o.label]:.2f}, {size}"
+        text = _draw_object(axes, o, found.names.map_name(o.label), own, corners, number)
         if number < LISTED:
-            axes.plot([], [], "s", ms=6, color=colour, label=text)
+            axes.plot([], [], "s", ms=6, color=distinct_colour(number), label=text)
     if len(ordered) > LISTED:
         axes.plot([], [], " ", label=f"and {len(ordered) - LISTED} smaller ones: see objects.json")
     path_points = trajectory.positions_world @ R_upright_world.T
@@ -66,3 +62,20 @@ def draw_objects(
     axes.set_title(f"{len(found.objects)} objects from above, {len(cloud.ids)} landmarks")
     axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     figure.savefig(path, format="png")
+
+
+def _draw_object(
+    axes: Axes, o: MapObject, label: str, points: Array, corners: Array, number: int
+) -> str:
+    """Draw one with its points (N, 2) and its box's corners (8, 2); its text for the legend."""
+    from matplotlib.collections import LineCollection  # noqa: PLC0415 - loads slowly
+
+    colour, name = distinct_colour(number), f"{label} {o.id}"
+    axes.scatter(points[:, 0], points[:, 1], s=5, color=colour, linewidths=0)
+    axes.add_collection(LineCollection(list(corners[EDGES]), colors=[colour], linewidths=1.6))
+    box = {"facecolor": "white", "alpha": 0.7, "pad": 0.8, "linewidth": 0}
+    place = corners.mean(axis=0)
+    axes.annotate(name, place, fontsize=9, ha="center", va="center", color=colour, bbox=box)
+    long_m, short_m = np.sort(o.box.size_m[:2])[::-1]
+    size = f"{long_m:.2f} x {short_m:.2f} x {o.box.size_m[2]:.2f} m"
+    return f"{name}: {o.distribution[o.label]:.2f}, {size}"

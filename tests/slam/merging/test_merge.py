@@ -136,6 +136,10 @@ def test_a_run_without_a_common_place_is_named(runs: Path, tmp_path: Path) -> No
     with pytest.raises(InputError, match=r"far: has no place in common with the other runs"):
         merge_runs(MergeOptions((runs / "first", runs / "far"), out))
     assert not out.exists()
+    before = shutil.copytree(runs / "second", out)
+    with pytest.raises(InputError, match="has no place in common"):
+        merge_runs(MergeOptions((runs / "first", runs / "far"), out, overwrite=True))
+    assert (before / "map").read_bytes() == (runs / "second" / "map").read_bytes()
 
 
 def test_what_cannot_be_merged_is_refused(
