@@ -188,8 +188,6 @@ def _write(
     """Write the result files, and the trajectory of each run by its own stamps."""
     save(system, folder, rows, None, folder.path.name)
     merged = system.trajectory()
-    for old in folder.path.glob(TRAJECTORY_OF_RUN.format("*")):
-        old.unlink()
     for number, source in enumerate(sources, 1):
         begin_s, end_s = source.span_s
         stamps_s = merged.timestamps_s

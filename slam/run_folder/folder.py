@@ -76,6 +76,7 @@ SEQUENCE_FILES = ("rgb.txt", "depth.txt", "associations.txt")
 DENSE = "dense"
 HEALTH = "health.json"
 SOMETIMES = (CHECKPOINT, CAMERA, COVARIANCES, HEALTH, JOINED, *SEMANTIC_FILES)
+OF_MERGED_RUNS = "trajectory_run_*.txt"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("bmask_slam",)
 GROWING = {FRAMES: COLUMNS, EVENTS: EVENT_COLUMNS}
@@ -258,7 +259,7 @@ def _clear(path: Path, overwrite: bool) -> None:
         if FRAMES in held:
             with (path / FRAMES).open("rb") as file:
                 lock_file(file, path)
-        _remove(path, held)
+        _remove(path, [*held, *(old.name for old in path.glob(OF_MERGED_RUNS) if held)])
     except OSError as error:
         raise _unwritable(path, error) from error
 

@@ -42,6 +42,7 @@ def test_overwrite_removes_only_the_run(tmp_path: Path) -> None:
     (tmp_path / "graph/values").write_text("earlier")
     (tmp_path / "metrics.json").write_text("earlier")
     (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "trajectory_run_2.txt").write_text("of a merged run")
     with RunFolder(tmp_path, overwrite=True):
         pass
     names = ["events.csv", "frames.csv", "log.txt", "notes.txt"]
