@@ -29,9 +29,7 @@ class ObjectPoints:
         self._points: Floats = np.zeros((0, 3), np.float32)  # in the anchor keyframe's frame
         self._anchors: Ints = np.zeros(0, np.int64)
         self._owners: Ints = np.zeros(0, np.int64)
-        self._covered: Ints = np.zeros(
-            (0, 2), np.int64
-        )  # views with the point: under the mask, all
+        self._covered: Ints = np.zeros((0, 2), np.int64)  # views of the point: under the mask, all
         self._sightings: Ints = np.zeros((0, 2), np.int64)  # object, keyframe
         self._seen_s: Array = np.zeros(0)
         self._landmarks: Ints = np.zeros((0, 2), np.int64)  # landmark, object

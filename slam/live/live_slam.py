@@ -53,7 +53,7 @@ class LiveSlam(SensorInput):
     A context manager: leaving it ends the processes and saves everything, also after an error.
 
     Attributes:
-        camera: of the frames; another one once calibration has found its times.
+        camera: of the frames; another one once calibration has found one.
         frames_dropped: by the source, which sets it.
         source_counts: of the source, for ``health``.
         rows: what metrics.json holds, after ``close``.

@@ -53,7 +53,7 @@ SWITCH_S = 0.0005
 MASKS_S = 10.0
 """Longest wait for the masks of the last keyframes at the end."""
 CALIBRATION_S = 15.0
-"""Longest wait for an estimate of the camera's times that is under way at the end."""
+"""Longest wait for an estimate of the camera that is under way at the end."""
 FINISH_S = 600.0
 
 
@@ -99,7 +99,7 @@ class LiveSystem(SlamSystem):
         remote: the copy of the map, and the process that owns the map.
         segmenter: the process that makes masks, if any.
         dense: the process that makes submaps, if any.
-        calibration: the process that estimates the camera's times, if any.
+        calibration: the process that estimates the camera, if any.
     """
 
     def __init__(
@@ -147,7 +147,7 @@ class LiveSystem(SlamSystem):
         return None if made is None else self.remote.world.keyframes.get(made)
 
     def use_camera(self, found: CameraEstimated) -> None:
-        """Track with a camera of other times from the next frame on, and tell the map."""
+        """Track with another camera from the next frame on, and tell the map."""
         if found.camera is not None:
             self.camera = self.camera_tracker.tracker.camera = found.camera
             self.remote.send(UseCamera(found.camera, found.motions))
@@ -219,7 +219,7 @@ class LiveSystem(SlamSystem):
         """Catch up until at most ``waiting`` keyframes wait for the map, or until the timeout.
 
         With a finite ``waiting`` it also waits while the dense map would drop a keyframe, and, for
-        as long as that takes, for an estimate of the camera's times.
+        as long as that takes, for an estimate of the camera.
         """
         deadline_s = time.monotonic() + timeout_s
         self.catch_up()

@@ -140,7 +140,7 @@ def _finished(active: ActiveRun, make_system: MakeSystem) -> RunSummary:
 def _calibrator(
     options: RunOptions, state: SelfCalibration, masks: RememberingSegmenter | None
 ) -> SelfCalibrator:
-    """What looks for the camera's times; nothing in a run that uses a map."""
+    """What looks for readout, delay and bend of the camera; nothing in a run that uses a map."""
     mode = "off" if options.map or options.localise else options.calibrate
     return SelfCalibrator(state, mode, masks)
 

@@ -169,7 +169,7 @@ class MapServer:
             self.system.map.prune_landmarks(ids)
 
     def use_camera(self, message: UseCamera) -> None:
-        """Go on with a camera of other times, and send the map that was adjusted to it."""
+        """Go on with another camera, and send the map that was adjusted to it."""
         started_s = time.perf_counter()
         system = self.system
         system.camera = system.camera_tracker.tracker.camera = message.camera

@@ -1,4 +1,4 @@
-"""Tracking's side of calibration: when the camera's times are estimated, and what came of it.
+"""Tracking's side of calibration: when the camera is estimated, and what came of it.
 
 The process gets the depth images around each keyframe. After so many frames with one camera the
 map's process is asked for a state, and the calibration's process estimates from that. Neither

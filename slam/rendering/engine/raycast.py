@@ -121,7 +121,7 @@ class Renderer:
         h, w = self._camera.height, self._camera.width
         t, triangle, rays = hits
         depth = np.where(triangle >= 0, t, np.nan).astype(np.float32)
-        normals, _ = _facing(tables[0].take(triangle, axis=0, mode="clip")[:, 12:15], rays)
+        normals, _ = _facing(tables[0][:, 12:15].take(triangle, axis=0, mode="clip"), rays)
         normals = normals @ T_world_camera[:3, :3].astype(np.float32)
         return depth.reshape(h, w), normals.reshape(h, w, 3)
 
