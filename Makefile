@@ -29,6 +29,8 @@ demo: $(DEMO)
 	@$(BIN)/bmask-slam run $(DEMO) --out runs/demo --overwrite
 	@$(BIN)/bmask-slam map runs/demo --mesh --plan
 	@$(BIN)/bmask-slam query runs/demo
+	@$(BIN)/bmask-slam film runs/demo --quiet > /dev/null
+	@$(BIN)/bmask-slam report runs/demo
 	@$(BIN)/bmask-slam live $(DEMO) --map --out runs/demo-live --overwrite
 	@$(BIN)/bmask-slam compare rendered --out runs/demo-comparison --sequences office \
 	  --configurations "default,without registration" --seeds 0

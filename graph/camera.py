@@ -131,8 +131,9 @@ class Camera:
 
     def project(self, points_camera: Array) -> Array:
         """Undistorted pixels (..., 2) of camera-frame points (..., 3); z must be positive."""
-        x, y, z = np.moveaxis(points_camera, -1, 0)
-        return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
+        z = points_camera[..., 2]
+        u = self.fx * points_camera[..., 0] / z + self.cx
+        return columns(u, self.fy * points_camera[..., 1] / z + self.cy)
 
     def project_distorted(self, points_camera: Array) -> Array:
         """Pixels (N, 2) in the image as recorded of camera-frame points (N, 3) with z > 0."""
@@ -181,8 +182,15 @@ class Camera:
     def backproject(self, pixels: Array, depth_m: Array) -> Array:
         """Camera-frame points (..., 3) of undistorted pixels (..., 2) at z-depth (...) in m."""
         x = (pixels[..., 0] - self.cx) / self.fx * depth_m
-        y = (pixels[..., 1] - self.cy) / self.fy * depth_m
-        return np.stack([x, y, np.broadcast_to(depth_m, x.shape)], axis=-1)
+        return columns(x, (pixels[..., 1] - self.cy) / self.fy * depth_m, depth_m)
+
+
+def columns(first: Array, *others: Array) -> Array:
+    """Arrays (...) side by side (..., K), of the first one's shape and type."""
+    joined = np.empty((*first.shape, 1 + len(others)), first.dtype)
+    for number, column in enumerate((first, *others)):
+        joined[..., number] = column
+    return joined
 
 
 def depth_distortion_terms(places: Array) -> Array:
@@ -201,12 +209,12 @@ def distort_normalised(normalised: Array, distortion: Sequence[float] | Array) -
     The order of operations is OpenCV's, so that the results are the same to the last bit.
     """
     k1, k2, p1, p2, k3 = distortion
-    x, y = np.moveaxis(normalised, -1, 0)
+    x, y = normalised[..., 0], normalised[..., 1]
     r2 = x * x + y * y
     r4 = r2 * r2
     radial = 1 + k1 * r2 + k2 * r4 + k3 * (r4 * r2)
     xy, xx, yy = 2 * x * y, r2 + 2 * x * x, r2 + 2 * y * y
-    return np.stack([x * radial + p1 * xy + p2 * xx, y * radial + p1 * yy + p2 * xy], axis=-1)
+    return columns(x * radial + p1 * xy + p2 * xx, y * radial + p1 * yy + p2 * xy)
 
 
 def undistort_normalised(normalised: Array, distortion: Sequence[float] | Array) -> Array:
@@ -215,7 +223,7 @@ def undistort_normalised(normalised: Array, distortion: Sequence[float] | Array)
     A point where the model folds back (negative radial factor) stays as it is.
     """
     k1, k2, p1, p2, k3 = distortion
-    x0, y0 = np.moveaxis(normalised, -1, 0)
+    x0, y0 = normalised[..., 0], normalised[..., 1]
     x, y = x0, y0
     folded = np.zeros(x0.shape, bool)
     for _ in range(UNDISTORTION_STEPS):
@@ -226,7 +234,7 @@ def undistort_normalised(normalised: Array, distortion: Sequence[float] | Array)
         dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
         x = np.where(folded, x0, (x0 - dx) * inverse_radial)
         y = np.where(folded, y0, (y0 - dy) * inverse_radial)
-    return np.stack([x, y], axis=-1)
+    return columns(x, y)
 
 
 def distortion_terms(normalised: Array) -> Array:

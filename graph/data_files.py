@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, did_you_mean
 
 
 def data_path(*parts: str) -> Path:
@@ -19,5 +19,7 @@ def data_path(*parts: str) -> Path:
     path = root.joinpath(*parts)
     if not path.exists():
         available = sorted(p.stem for p in path.parent.glob(f"*{path.suffix}"))
-        raise InputError(f"{path}: no such file; there are: {', '.join(available) or 'none'}")
+        listed = ", ".join(available) or "none"
+        near = did_you_mean(path.stem, available)
+        raise InputError(f"{path}: no such file; there are: {listed}{near}")
     return path

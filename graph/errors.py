@@ -1,6 +1,8 @@
 """The exception for broken input from outside."""
 
+import difflib
 import math
+from collections.abc import Iterable
 
 MAX_MESSAGE = 2000
 
@@ -19,6 +21,13 @@ class InputError(Exception):
         super().__init__(message)
 
 
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """The end of a message about an unknown name: "; did you mean X?", or "" if none is near."""
+    near = difflib.get_close_matches(word[:MAX_NAME], list(known), 1, 0.6)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+MAX_NAME = 100
 MAX_NUMBER = 1e100
 """Largest number in a text file: its square is a number too."""
 MAX_WHOLE = 2**63 - 1

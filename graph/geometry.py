@@ -25,7 +25,11 @@ def make_pose(R: Array, t: Array) -> Array:
 def inverse(T_a_b: Array) -> Array:
     """Inverse of rigid transforms (..., 4, 4): ``T_b_a``."""
     R_b_a = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
-    return make_pose(R_b_a, -(R_b_a @ T_a_b[..., :3, 3:])[..., 0])
+    T_b_a = np.zeros(T_a_b.shape)
+    T_b_a[..., :3, :3] = R_b_a
+    T_b_a[..., :3, 3:] = -(R_b_a @ T_a_b[..., :3, 3:])
+    T_b_a[..., 3, 3] = 1.0
+    return T_b_a
 
 
 def orthonormalised(T: Array) -> Array:
@@ -37,7 +41,11 @@ def orthonormalised(T: Array) -> Array:
     R = T[..., :3, :3]
     for _ in range(3):  # Newton's iteration for the polar factor: the error e becomes 3/4 e^2
         R = 1.5 * R - 0.5 * R @ (np.swapaxes(R, -1, -2) @ R)
-    return make_pose(R, T[..., :3, 3])
+    nearest = np.zeros(T.shape)
+    nearest[..., :3, :3] = R
+    nearest[..., :3, 3] = T[..., :3, 3]
+    nearest[..., 3, 3] = 1.0
+    return nearest
 
 
 def carried_along(T_world_a: Array, T_world_old: Array, T_world_new: Array) -> Array:
@@ -94,7 +102,6 @@ def so3_exp(omega_rad: Array) -> Array:
 def so3_log(R: Array) -> Array:
     """Rotation vectors (..., 3) in radians of rotations (..., 3, 3), right up to pi."""
     q = quaternion_from_rotation(R)
-    q = np.where(q[..., 3:] < 0, -q, q)
     n = np.linalg.norm(q[..., :3], axis=-1)
     angle = 2 * np.arctan2(n, q[..., 3])
     scale = np.where(n < 1e-12, 2.0, angle / np.where(n < 1e-12, 1.0, n))
@@ -130,6 +137,9 @@ def rotation_from_quaternion(q_xyzw: Array) -> Array:
     return np.eye(3) + 2 * w * S + 2 * (S @ S)
 
 
+_OFF_DIAGONAL = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+
+
 def quaternion_from_rotation(R: Array) -> Array:
     """Unit quaternions (..., 4) in TUM order x y z w with w >= 0 from rotations (..., 3, 3).
 
@@ -147,16 +157,12 @@ def quaternion_from_rotation(R: Array) -> Array:
         R[..., 0, 2] + R[..., 2, 0],
         R[..., 2, 1] + R[..., 1, 2],
     )
-    K = np.stack(
-        [
-            np.stack([1 + m00 - m11 - m22, d, e, a], -1),
-            np.stack([d, 1 - m00 + m11 - m22, f, b], -1),
-            np.stack([e, f, 1 - m00 - m11 + m22, c], -1),
-            np.stack([a, b, c, 1 + m00 + m11 + m22], -1),
-        ],
-        -2,
-    )
+    K = np.empty((*m00.shape, 4, 4))
+    K[..., 0, 0], K[..., 1, 1] = 1 + m00 - m11 - m22, 1 - m00 + m11 - m22
+    K[..., 2, 2], K[..., 3, 3] = 1 - m00 - m11 + m22, 1 + m00 + m11 + m22
+    for (i, j), value in zip(_OFF_DIAGONAL, (d, e, a, f, b, c), strict=True):
+        K[..., i, j] = K[..., j, i] = value
     best = np.argmax(np.diagonal(K, axis1=-2, axis2=-1), axis=-1)
-    q = np.take_along_axis(K, best[..., None, None], axis=-2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    q = K.reshape(-1, 4, 4)[np.arange(best.size), best.ravel()].reshape(K.shape[:-1])
+    q = q / np.sqrt((q * q).sum(axis=-1, keepdims=True))
     return np.where(q[..., 3:] < 0, -q, q)

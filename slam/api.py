@@ -34,6 +34,7 @@ class RunKeywords(TypedDict, total=False):
     localise: AnyPath
     calibrate: str
     dense: bool
+    mesh_voxel_m: float
     quiet: bool
 
 
@@ -44,6 +45,7 @@ class MapKeywords(TypedDict, total=False):
     excluded: tuple[str, ...]
     keep_excluded: bool
     voxel_m: float
+    mesh_voxel_m: float
     source: str
     device: str
     keep_volume: bool

@@ -7,14 +7,17 @@ from __future__ import annotations
 
 import argparse
 import errno
+import logging
 import os
+import re
 import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
+from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 from bmask_slam import __version__
 from bmask_slam.commands.calibrate import add_calibrate
@@ -27,12 +30,35 @@ from bmask_slam.commands.results import add_export, add_query
 from bmask_slam.commands.run import add_run
 from bmask_slam.commands.segmentation import add_evaluate_segmentation, add_segment, add_train
 from bmask_slam.commands.sequences import add_convert, add_download, add_info, add_render
-from bmask_slam.commands.view import add_view
-from bmask_slam.graph.errors import InputError
+from bmask_slam.commands.show import add_film, add_report, add_view
+from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.extras import import_extra
 from bmask_slam.runtime.memory import is_out_of_memory, memory_limit_bytes
 from bmask_slam.runtime.stop_request import SIGNALS
 
+ADDED = (
+    add_run,
+    add_live,
+    add_evaluate,
+    add_render,
+    add_convert,
+    add_info,
+    add_download,
+    add_optimise,
+    add_export,
+    add_calibrate,
+    add_map,
+    add_merge,
+    add_query,
+    add_report,
+    add_film,
+    add_view,
+    add_segment,
+    add_train,
+    add_evaluate_segmentation,
+    add_compare,
+)
+"""What adds a command, in the order of --help."""
 DESCRIPTION = "RGB-D SLAM on a GTSAM factor graph: a trajectory and a landmark map from a sequence."
 EPILOG = """\
 first steps:
@@ -59,6 +85,11 @@ CURES = {
 MEMORY = "out of memory; free some, raise its limit (ulimit -v), or take smaller input"
 MIN_MEMORY_BYTES = 3_000_000_000
 """Of addresses. With less OpenBLAS does not load, crashes, or tries without an end to get some."""
+WAITING = {"OPENBLAS_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+"""Set unless the user has set them, before the libraries are loaded. Matrices here are small: a
+second thread of OpenBLAS gains nothing, and spins while it waits. Beside other work on the machine,
+which then waits for a core, a run took two to three times as long."""
+CHOICE = re.compile(r"invalid choice: '(.*?)' \(choose from (.*)\)")
 MAX_LINE = 480
 """Characters of an error: what a file holds may be of any length."""
 
@@ -67,10 +98,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; the exit status is 0, 1 for broken input, 2 for a wrong command line, and
     128 + signal when a signal ended it.
     """
+    for name, value in WAITING.items():
+        os.environ.setdefault(name, value)
     try:
         arguments = make_parser().parse_args(argv)
         _check_memory()
-        with _terminations():
+        with _terminations(), _console_log(arguments.verbose):
             code = int(arguments.handler(arguments))
         if code == 128 + signal.SIGHUP:  # the terminal was closed: nobody reads on
             _discard_output()
@@ -96,6 +129,13 @@ def _discard_output() -> None:
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (sys.stdout, sys.stderr):
         os.dup2(nowhere, stream.fileno())
+
+
+def _console_log(verbose: bool) -> AbstractContextManager[None]:
+    """Warnings on stderr, with -v all that a run's log.txt gets."""
+    from bmask_slam.runtime.progress import console_log
+
+    return console_log(logging.INFO if verbose else logging.WARNING)
 
 
 def _check_memory() -> None:
@@ -160,13 +200,44 @@ class _PrintCompletion(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *given: Any) -> None:
         _, shell, _ = given
         shtab: Any = import_extra("shtab", "--print-completion", "completion")
+        for command in _commands(parser).values():
+            for action in command._actions:  # of a path the shell completes files
+                if action.type is Path or action.metavar in ("F", "DIR", "RUN"):
+                    action.complete = shtab.FILE  # type: ignore[attr-defined]
         print(shtab.complete(parser, shell))
         parser.exit()
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says which command, option or choice was meant by a mistyped one."""
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse does."""
+        found, rest = self.parse_known_args(args, namespace)
+        if rest:
+            command = _commands(self).get(found.command, self)
+            known = command._option_string_actions
+            near = did_you_mean(rest[0].partition("=")[0], known)
+            command.error(f"unrecognized arguments: {' '.join(rest)}{near}")
+        return found
+
+    def error(self, message: str) -> NoReturn:
+        """As argparse does."""
+        if wrong := CHOICE.search(message):
+            choices = [choice.strip(" '\"") for choice in wrong[2].split(",")]
+            message += did_you_mean(wrong[1], choices)
+        super().error(message)
+
+
+def _commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """The parsers of the commands by name."""
+    actions = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    return {name: command for action in actions for name, command in action.choices.items()}
+
+
 def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands; each stores its function as ``handler``."""
-    parser = argparse.ArgumentParser(
+    parser: argparse.ArgumentParser = _Parser(
         prog="bmask-slam",
         description=DESCRIPTION,
         epilog=EPILOG,
@@ -179,23 +250,12 @@ def make_parser() -> argparse.ArgumentParser:
         choices=("bash", "zsh", "tcsh"),
         help="tab completion for a shell; see docs/install.md",
     )
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    add_run(commands)
-    add_live(commands)
-    add_evaluate(commands)
-    add_render(commands)
-    add_convert(commands)
-    add_info(commands)
-    add_download(commands)
-    add_optimise(commands)
-    add_export(commands)
-    add_calibrate(commands)
-    add_map(commands)
-    add_merge(commands)
-    add_query(commands)
-    add_view(commands)
-    add_segment(commands)
-    add_train(commands)
-    add_evaluate_segmentation(commands)
-    add_compare(commands)
+    commands = parser.add_subparsers(
+        title="commands", metavar="COMMAND", required=True, dest="command"
+    )
+    for add in ADDED:
+        add(commands)
+    for command in _commands(parser).values():
+        text = "say on stderr what is done, as in log.txt"
+        command.add_argument("-v", "--verbose", action="store_true", help=text)
     return parser

@@ -43,8 +43,9 @@ def installed_path(path: Path) -> str:
 
 
 def files_of_the_tree() -> set[str]:
-    """Path in the wheel of every module, of all data and of the marker of typed packages."""
-    modules = {path for k in FOLDERS.values() for path in (ROOT / k).rglob("*.py")}
+    """Path in the wheel of every module, template and style, of all data, and of py.typed."""
+    kinds = ("*.py", "*.j2", "*.css")
+    modules = {p for k in FOLDERS.values() for kind in kinds for p in (ROOT / k).rglob(kind)}
     data = {path for path in (ROOT / "data").rglob("*") if path.is_file()}
     chosen = {path for path in modules | data if "__pycache__" not in path.parts}
     return {installed_path(path) for path in (*chosen, ROOT / "slam/py.typed")}

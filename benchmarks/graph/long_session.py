@@ -3,10 +3,11 @@
     python -m benchmarks.graph.long_session [--keyframes 2000] [--measurements 100] [--out DIR]
 
 Each keyframe measures 100 landmarks with noise as in the red kitchen. At a known place a loop is
-added first, then its landmarks are matched again. All updates go through ``Smoother.update`` as in
-a run. Afterwards all marginalised landmarks are restored, and the session is compared with the
-optimum of that full graph. ``--full N`` also measures the first N keyframes without
-marginalisation.
+added first, then its landmarks are matched again, and keyframes whose landmarks are seen by enough
+others are culled, as in a run (``--keep-all``: they are not). All updates go through
+``Smoother.update`` as in a run. Afterwards all marginalised landmarks are restored, and the session
+is compared with the optimum of that full graph. ``--full N`` also measures the first N keyframes
+without marginalisation.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from matplotlib.figure import Figure
 from benchmarks.graph.building import CAMERA, landmarks, visible, walk
 from benchmarks.graph.pose_graphs import position_rmse_m
 from bmask_slam.back_end.factor_selection import FactorSelectionConfig
+from bmask_slam.back_end.landmark_management import MappingConfig
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
 from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, RelativePose
@@ -34,13 +36,13 @@ SIGMAS_PX = np.array([1.0, 1.0, 0.2])
 """Of u, v and disparity, as in the red kitchen (docs/architecture.md)."""
 STEP_SIGMAS = np.array([0.001] * 3 + [0.003] * 3)
 LOOP_SIGMAS = np.array([0.002] * 3 + [0.01] * 3)
-FEED = FactorSelectionConfig()
+FEED, RULES = FactorSelectionConfig(), MappingConfig()
 GAP = 40
 """Number of keyframes after which a landmark counts as matched again rather than tracked."""
 FOUND = 0.8
 """Share of the visible landmarks that a keyframe detects."""
-ROUNDS, PER_M2 = 5, 14.0
-COLUMNS = ("update_ms", "solver_ms", "landmarks", "factors", "ate_m", "rss_mb")
+PER_ROUND, PER_M2 = 400, 14.0
+COLUMNS = ("update_ms", "solver_ms", "keyframes", "landmarks", "factors", "ate_m", "rss_mb")
 
 
 class FrontEnd:
@@ -48,21 +50,24 @@ class FrontEnd:
 
     def __init__(self, args: argparse.Namespace, marginalise: bool) -> None:
         self.rng = np.random.default_rng(args.seed)
-        self.poses = walk(ROUNDS, args.keyframes // ROUNDS, self.rng)
+        self.poses = walk(-(-max(args.keyframes, args.full) // PER_ROUND), PER_ROUND, self.rng)
         self.points, self.on_wall = landmarks(PER_M2, self.rng)
         self.measurements, self.marginalise = args.measurements, marginalise
-        self.observed_ids: list[Ints] = []
+        self.culls = not args.keep_all
+        self.observed_ids: list[Ints] = []  # none of a keyframe that was culled
+        self.observers = np.zeros(len(self.points), np.int64)
         self.last_observed = np.full(len(self.points), -1)
         self.loops: list[tuple[int, int]] = []
         self._in_known_place = False
 
-    def update(self, k: int, estimate: GraphEstimate | None) -> GraphUpdate:
+    def update(self, k: int, estimate: GraphEstimate | None, bases: set[int]) -> GraphUpdate:
         """The update of keyframe k; its initial pose carries the last one's error and more."""
         T = self._initial_pose(k, estimate)
         known = np.zeros(0, np.int64) if estimate is None else estimate.landmark_ids
         ids, z = self._measure(k)
         loops, ids, z = self._recognise(k, ids, z)
         self.observed_ids.append(ids)
+        self.observers[ids] += 1
         self.last_observed[ids] = k
         new = ~np.isin(ids, known)
         depth_m = CAMERA.stereo_bf_px_m / np.maximum(z[new, 0] - z[new, 2], 4.0)
@@ -76,7 +81,23 @@ class FrontEnd:
             Observations(np.full(len(ids), k), ids, z, sigmas),
             relative_poses=loops,
             marginalise_landmarks=self._outside_window(known) if self.marginalise else known[:0],
+            remove_keyframes=self._redundant(k, bases) if self.culls else known[:0],
         )
+
+    def _redundant(self, k: int, bases: set[int]) -> Ints:
+        """The youngest keyframe around keyframe k that is redundant, as ``Mapper`` culls it."""
+        kept = {0, *(end for loop in self.loops for end in loop), *bases}
+        here = np.zeros(len(self.points), bool)
+        here[self.observed_ids[k]] = True
+        for other in range(k - 3, 0, -1):
+            ids = self.observed_ids[other]
+            if other in kept or np.count_nonzero(here[ids]) < FEED.window_min_shared:
+                continue
+            if (self.observers[ids] > RULES.redundant_views).mean() > RULES.redundant_share:
+                self.observers[ids] -= 1
+                self.observed_ids[other] = ids[:0]
+                return np.array([other])
+        return np.zeros(0, np.int64)
 
     def _measure(self, k: int) -> tuple[Ints, Array]:
         """Some visible landmarks, the last observed first, and their noisy measurements."""
@@ -124,7 +145,7 @@ class FrontEnd:
     def _initial_pose(self, k: int, estimate: GraphEstimate | None) -> Array:
         if estimate is None:
             return self.poses[k]
-        step = inverse(self.poses[k - 1]) @ self.poses[k]
+        step = inverse(self.poses[estimate.keyframe_ids[-1]]) @ self.poses[k]
         return estimate.poses_world_camera[-1] @ step @ se3_exp(self.rng.normal(0, STEP_SIGMAS))
 
 
@@ -136,13 +157,14 @@ def ate_m(estimate: GraphEstimate, poses: Array) -> float:
 def session(
     args: argparse.Namespace, marginalise: bool, count: int
 ) -> tuple[Smoother, FrontEnd, GraphEstimate, Array]:
-    """Run a session of ``count`` keyframes; returns also the rows (K, 6) of COLUMNS."""
+    """Run a session of ``count`` keyframes; returns also the rows (K, 7) of COLUMNS."""
     front, smoother = FrontEnd(args, marginalise), Smoother(CAMERA)
     estimate, rows = None, []
     for k in range(count):
-        estimate = smoother.update(front.update(k, estimate))
+        bases = smoother.tables.marginalised.bases
+        estimate = smoother.update(front.update(k, estimate, bases))
         error_m = ate_m(estimate, front.poses) if k % 50 == 49 else np.nan
-        sizes = len(estimate.landmark_ids), estimate.factors
+        sizes = len(estimate.keyframe_ids), len(estimate.landmark_ids), estimate.factors
         rows.append((estimate.update_ms, estimate.solver_ms, *sizes, error_m, peak_rss_mb()))
         if k % 50 == 49:
             sys.stderr.write(f"\r{k + 1} of {count} keyframes, {rows[-1][0]:.0f} ms ")
@@ -166,10 +188,11 @@ def quarters(rows: Array) -> list[dict[str, float]]:
             "update_p95_ms": float(np.percentile(part[:, 0], 95)),
             "update_max_ms": float(part[:, 0].max()),
             "solver_median_ms": float(np.median(part[:, 1])),
-            "landmarks": float(part[-1, 2]),
-            "factors": float(part[-1, 3]),
-            "ate_mm": 1e3 * float(part[np.isfinite(part[:, 4]), 4][-1]),
-            "peak_rss_mb": float(part[-1, 5]),
+            "kept": float(part[-1, 2]),
+            "landmarks": float(part[-1, 3]),
+            "factors": float(part[-1, 4]),
+            "ate_mm": 1e3 * float(part[np.isfinite(part[:, 5]), 5][-1]),
+            "peak_rss_mb": float(part[-1, 6]),
         }
         for i, part in enumerate(rows[k * size : (k + 1) * size] for k in range(4))
     ]
@@ -204,6 +227,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--keyframes", type=int, default=2000, help="in all five rounds")
     parser.add_argument("--measurements", type=int, default=100, help="new ones a keyframe")
+    parser.add_argument("--keep-all", action="store_true", help="cull no redundant keyframe")
     parser.add_argument("--full", type=int, default=0, help="keyframes without marginalisation")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
@@ -219,7 +243,9 @@ def main() -> None:
     optimum = smoother.optimise_batch()
     batch_s = time.perf_counter() - started_s
     own_mm, full_mm = (1e3 * ate_m(e, front.poses) for e in (estimate, optimum))
-    apart_mm = 1e3 * ate_m(estimate, optimum.poses_world_camera)
+    _, a, b = np.intersect1d(estimate.keyframe_ids, optimum.keyframe_ids, return_indices=True)
+    poses = estimate.poses_world_camera[a], optimum.poses_world_camera[b]
+    apart_mm = 1e3 * position_rmse_m(*poses)
     print(f"ATE {own_mm:.2f} mm, full graph's optimum {full_mm:.2f} mm, apart {apart_mm:.2f} mm")
     print(f"full graph: {optimum.factors} factors, {batch_s:.0f} s in batch")
     full = session(args, False, args.full)[3] if args.full else np.zeros((0, len(COLUMNS)))

@@ -131,8 +131,8 @@ def _explanations() -> str:
         "over one second. End drift: error of the last pose with the first one put upon the "
         "reference's, as a share of the path, where the reference is exact. "
         "Times are of features and tracking, for every frame; what keyframes add is in the table "
-        "of stages. Features are made in a thread that runs ahead, so frames/s can exceed what the "
-        "times suggest, and falls below it by keyframes. Memory: peak of the whole process."
+        "of stages. Images are decoded in a thread that runs ahead. "
+        "Memory: peak of the whole process."
     )
 
 

@@ -98,8 +98,8 @@ def firm_components(ids: Ints, observations: Observations, edges: Edges, minimum
     if len(monocular):
         shared = shared - shared_landmarks(ids, monocular)
     row, column = (shared >= minimum).nonzero()
-    pairs = [edge for edge in edges if len(edge) == 2 and np.isin(edge, ids).all()]
-    ends = np.searchsorted(ids, np.array(pairs, np.int64).reshape(-1, 2))
+    pairs = np.array([edge for edge in edges if len(edge) == 2], np.int64).reshape(-1, 2)
+    ends = np.searchsorted(ids, pairs[np.isin(pairs, ids).all(axis=1)])
     starts, stops = np.concatenate([row, ends[:, 0]]), np.concatenate([column, ends[:, 1]])
     links = coo_array((np.ones(len(starts), np.int8), (starts, stops)), (len(ids), len(ids)))
     return connected_components(links, directed=False)[1].astype(np.int64)

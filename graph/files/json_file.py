@@ -1,11 +1,17 @@
-"""JSON files from elsewhere: parsed and checked against a schema before anything uses them."""
+"""JSON from elsewhere, checked against a schema before anything uses it; and results as JSON."""
 
 from __future__ import annotations
 
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
 
+import numpy as np
 from pydantic import ConfigDict, StringConstraints, TypeAdapter, ValidationError
 
 from bmask_slam.graph.errors import InputError
@@ -42,6 +48,25 @@ def check_json(value: Any, schema: type[Content], where: str, cure: str) -> Cont
         return _adapter(cast("Any", schema)).validate_python(value)
     except ValidationError as error:
         raise InputError(f"{where}: {first_problem(error)}; {cure}") from error
+
+
+def format_json(value: object) -> str:
+    """A result as JSON: dataclasses by their fields, arrays as lists, what is not finite null."""
+    return json.dumps(_plain(value), indent=1, default=str)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    elif isinstance(value, Enum):
+        value = value.value
+    elif is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def first_problem(error: ValidationError) -> str:

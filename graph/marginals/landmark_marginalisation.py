@@ -19,6 +19,7 @@ place of their replacements: the full graph, for a batch optimisation.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -98,8 +99,12 @@ def remove_marginalised(
             keep &= (observations.keyframe_ids != keyframe) | (
                 observations.landmark_ids != landmark
             )
-        if not keep.all():
-            marginaliser.renew(number, keep)
+        if keep.all():
+            continue
+        culled = np.unique(observations.keyframe_ids[~keep])
+        whole = np.array_equal(keep, ~np.isin(observations.keyframe_ids, culled))
+        edges = marginaliser.without_leaves(number, culled.tolist()) if whole else None
+        marginaliser.renew(number, keep, edges)
     for landmark in landmarks.tolist():
         marginalised.summaries.pop(landmark, None)
         marginalised.returned.pop(landmark, None)
@@ -143,8 +148,13 @@ class _Marginaliser:
     config: SmootherConfig
     done: Marginalisation = field(default_factory=Marginalisation)
 
-    def add(self, chunk: Chunk, number: int, points: ValueTable) -> None:
-        """Make a chunk sparse, keep it, and summarise its landmarks that are out of the graph."""
+    def add(
+        self, chunk: Chunk, number: int, points: ValueTable, kept: tuple[int, ...] | None = None
+    ) -> None:
+        """Make a chunk sparse, keep it, and summarise its landmarks that are out of the graph.
+
+        With ``kept`` relative poses it is sparse already.
+        """
         tables, observations = self.tables, chunk.observations
         marginalised = tables.marginalised
         keyframes, ids = np.unique(observations.keyframe_ids), np.unique(observations.landmark_ids)
@@ -155,10 +165,11 @@ class _Marginaliser:
             self.camera,
             self.config,
         )
-        edges = self._tree(poses, observations) if len(keyframes) > 1 else []
-        numbers = tables.add_pose_factors(edges)
-        self.done.pose_factors += numbers
-        marginalised.add(replace(chunk, numbers=tuple(numbers)), number)
+        if kept is None:
+            edges = self._tree(poses, observations) if len(keyframes) > 1 else []
+            kept = tuple(tables.add_pose_factors(edges))
+            self.done.pose_factors += kept
+        marginalised.add(replace(chunk, numbers=kept), number)
         last = [marginalised.newest_with(j) <= number for j in ids.tolist()]
         out = ~tables.landmarks.contains(ids) & np.array(last, bool)
         summaries = make_summaries(observations, left, tables, self.camera)
@@ -176,14 +187,27 @@ class _Marginaliser:
         marginalised.bases.update(keyframes[is_base].tolist())
         return recover(poses, spanning_tree(poses, is_base), MARGINAL)
 
-    def renew(self, number: int, keep: Mask) -> None:
-        """Make a chunk sparse again from those of its observations that stay."""
+    def without_leaves(self, number: int, culled: list[int]) -> tuple[int, ...] | None:
+        """A chunk's relative poses without those of keyframes that end a branch of its tree.
+
+        They say all that the tree says of the others: a leaf is marginalised by leaving it out.
+        None if one of these keyframes connects others.
+        """
+        factors = self.tables.pose_factors
+        numbers = self.tables.marginalised.chunks[number].numbers
+        links = {n: factors[n].link for n in numbers if n in factors}
+        ends = Counter(k for link in links.values() for k in link)
+        if any(ends[k] > 1 for k in culled):
+            return None
+        return tuple(n for n, link in links.items() if not set(link) & set(culled))
+
+    def renew(self, number: int, keep: Mask, kept: tuple[int, ...] | None = None) -> None:
+        """Make a chunk sparse again from those of its observations that stay.
+
+        With ``kept``, of its relative poses those stay.
+        """
         tables, done = self.tables, self.done
         marginalised, chunk = tables.marginalised, tables.marginalised.remove(number)
-        present = [n for n in chunk.numbers if n in tables.pose_factors]
-        done.slots += [s for n in present if (s := tables.pose_factors[n].slot) != NO_SLOT]
-        done.pose_factors = [n for n in done.pose_factors if n not in present]
-        tables.remove_pose_factors(present)
         before = np.unique(chunk.observations.landmark_ids)
         out = np.array([j in marginalised.summaries for j in before.tolist()], bool)
         known = out | tables.landmarks.contains(before)
@@ -193,8 +217,14 @@ class _Marginaliser:
             if marginalised.newest_with(landmark) < number:
                 marginalised.summaries.pop(landmark, None)
         keep = keep & np.isin(chunk.observations.landmark_ids, ids)
+        stay = set(kept or ()) if keep.any() else set()
+        present = [n for n in chunk.numbers if n in tables.pose_factors and n not in stay]
+        done.slots += [s for n in present if (s := tables.pose_factors[n].slot) != NO_SLOT]
+        done.pose_factors = [n for n in done.pose_factors if n not in present]
+        tables.remove_pose_factors(present)
         if keep.any():
-            self.add(Chunk(chunk.observations.select(keep), chunk.is_summary[keep]), number, points)
+            rest = Chunk(chunk.observations.select(keep), chunk.is_summary[keep])
+            self.add(rest, number, points, kept)
 
 
 def _parts(observations: Observations, limit: int) -> Iterator[Ints]:

@@ -146,6 +146,7 @@ class SensorStreams:
     """
 
     rows: dict[str, Array] = field(default_factory=dict)
+    _room: dict[str, Array] = field(default_factory=dict, repr=False, compare=False)
 
     def __bool__(self) -> bool:
         return bool(self.rows)
@@ -153,9 +154,22 @@ class SensorStreams:
     def add(self, new: Measurements) -> None:
         """Add measurements; of those with a stamp that is known the older ones stay."""
         known = self.rows.get(new.sensor, new.rows[:0])
+        if len(known) and len(new.rows) and new.rows[0, 0] > known[-1, 0]:
+            self.rows[new.sensor] = self._appended(new.sensor, known, new.rows)
+            return
         merged = np.concatenate([known, new.rows])
         _, first = np.unique(merged[:, 0], return_index=True)
         self.rows[new.sensor] = merged[first]
+
+    def _appended(self, sensor: str, known: Array, later: Array) -> Array:
+        """Rows and later ones, in an array with room for more: live they come a few at a time."""
+        size = len(known) + len(later)
+        room = self._room.get(sensor, later[:0])
+        if known.base is not room or len(room) < size:
+            room = self._room[sensor] = np.empty((2 * size, known.shape[1]))
+            room[: len(known)] = known
+        room[len(known) : size] = later
+        return room[:size]
 
     def of(self, sensor: str) -> Array:
         """The rows (N, C) of a sensor; none if there are none."""

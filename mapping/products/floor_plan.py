@@ -19,6 +19,8 @@ FLOOR_COLOUR = (235, 230, 215)
 HEIGHTS_M = (0.1, 1.9)
 """Heights above the floor between which points are obstacles; walls may be higher."""
 CEILING = "ceiling"
+NAMED_M2 = 0.05
+FONT, NAME_SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.5
 GAP_M = 0.3
 UPRIGHT_COSINE = 0.95
 BIN_M = 0.04
@@ -176,6 +178,7 @@ class FloorPlan:
         image = np.kron(colours[grid + 2], np.ones((scale, scale, 1), np.uint8))
         line = np.rint(path * scale).astype(np.int32)
         cv2.polylines(image, [line], False, (220, 30, 30), 2, cv2.LINE_AA)
+        _write_names(image, grid, names, (scale, self.frame.cell_m))
         margin, white = 40, (EMPTY,) * 3
         image = cv2.copyMakeBorder(
             image, margin, 2 * margin, margin, margin, cv2.BORDER_CONSTANT, value=white
@@ -183,6 +186,31 @@ class FloorPlan:
         _scale_bar(image, scale / self.frame.cell_m, margin)
         present = [label for label in range(len(names)) if (grid == label).any()]
         return with_legend(image, names, present)
+
+
+def _write_names(
+    image: Image, grid: NDArray[np.int16], names: Sequence[str], sizes: tuple[int, float]
+) -> None:
+    """Write its class on each region of cells (H, W) that is NAMED_M2 large, but for structure.
+
+    ``sizes``: pixels of the image and metres a cell.
+    """
+    scale, cell_m = sizes
+    unnamed = (*STRUCTURE, *FLOORS, CEILING)
+    for label in (k for k in range(1, len(names)) if names[k] not in unnamed):
+        count, parts, stats, _ = cv2.connectedComponentsWithStats((grid == label).astype(np.uint8))
+        large = stats[:, cv2.CC_STAT_AREA] * cell_m**2 >= NAMED_M2
+        (width, height), _ = cv2.getTextSize(names[label], FONT, NAME_SIZE, 1)
+        for part in (k for k in range(1, count) if large[k]):
+            inside = np.pad((parts == part).astype(np.uint8), 1)
+            far = cv2.distanceTransform(inside, cv2.DIST_L2, 3)
+            row, column = np.unravel_index(int(far.argmax()), far.shape)
+            x, y = (float(column) - 0.5) * scale, (float(row) - 0.5) * scale
+            corner = int(x - width / 2), int(y + height / 2)
+            for grey, stroke in ((EMPTY, 4), (0, 1)):
+                cv2.putText(
+                    image, names[label], corner, FONT, NAME_SIZE, (grey,) * 3, stroke, cv2.LINE_AA
+                )
 
 
 def _labels(votes: Ints) -> Ints:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,8 @@ LOWEST_M = 0.5
 """Without the floor, a cell is free where at least half of so much above the ``low`` is free."""
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Of cells, as in nav_msgs/OccupancyGrid."""
+HIT, MISS = np.log(0.7 / 0.3), np.log(0.4 / 0.6)
+"""Log-odds that a voxel is occupied, by one map in which it is, or is free."""
 _OFFSET, _BITS = 1 << 20, 21
 LIMIT = 1 << 15
 """Voxels from the origin in each direction, as in OctoMap's trees of 16 levels."""
@@ -55,11 +58,11 @@ class VoxelCarver:
         self._occupied: list[Ints] = []
         self._free: list[Ints] = []
 
-    def add_surface(self, points_world: Array) -> None:
-        """Points (N, 3) of what stands still."""
+    def add_surface(self, points_world: Array, least: int = MIN_POINTS) -> None:
+        """Points (N, 3) of what stands still; a voxel needs ``least`` of them."""
         cells = np.floor(transform(self._T, points_world) / self._resolution_m)
         codes, counts = np.unique(_packed(cells), return_counts=True)
-        self._occupied.append(codes[counts >= MIN_POINTS])
+        self._occupied.append(codes[counts >= least])
 
     def carve(self, depth_m: Floats, camera: Camera, T_world_camera: Array) -> None:
         """Free what lies before a depth image (H, W) of a camera without distortion.
@@ -75,13 +78,26 @@ class VoxelCarver:
         pixels = np.stack([columns.ravel(), rows.ravel()], axis=-1)[seen].astype(float)
         ends = camera.backproject(pixels, np.ones(len(pixels)))
         lengths = np.linalg.norm(ends, axis=1)
-        ranges_m = np.minimum(z_m[seen] * lengths, MAX_RANGE_M)
         T_map_camera = self._T @ T_world_camera
-        directions = (ends / lengths[:, None]) @ T_map_camera[:3, :3].T
-        reach = ranges_m / self._resolution_m - MARGIN_VOXELS
+        self._free_along(
+            T_map_camera[:3, 3], (ends / lengths[:, None]) @ T_map_camera[:3, :3].T,
+            z_m[seen] * lengths,
+        )  # fmt: skip
+
+    def carve_to(self, points_world: Array, begin_world: Array) -> None:
+        """Free what lies before points (N, 3) that were seen from a place (3,)."""
+        begin_map = transform(self._T, begin_world[None])[0]
+        rays = transform(self._T, points_world) - begin_map
+        lengths_m = np.linalg.norm(rays, axis=1)
+        far = lengths_m > 0
+        self._free_along(begin_map, rays[far] / lengths_m[far, None], lengths_m[far])
+
+    def _free_along(self, begin_map: Array, directions: Array, lengths_m: Array) -> None:
+        """Free the voxels along rays (N, 3), but for the last ones."""
+        reach = np.minimum(lengths_m, MAX_RANGE_M) / self._resolution_m - MARGIN_VOXELS
         order = np.argsort(-reach)
         directions, reach = directions[order], reach[order]
-        begin, found = T_map_camera[:3, 3] / self._resolution_m, []
+        begin, found = begin_map / self._resolution_m, []
         for step in range(int(max(reach.max(initial=0), 0)) + 1):
             active = int(np.searchsorted(-reach, -step))
             found.append(np.unique(_packed(np.floor(begin + step * directions[:active]))))
@@ -97,8 +113,7 @@ class VoxelCarver:
         occupied = np.unique(np.concatenate([none, *self._occupied]))
         free = np.setdiff1d(np.concatenate([none, *self._free]), occupied)
         codes = np.concatenate([occupied, free])
-        shifts = np.array([2 * _BITS, _BITS, 0])
-        keys = (codes[:, None] >> shifts & ((1 << _BITS) - 1)) - _OFFSET
+        keys = _unpacked(codes)
         if not len(keys) or np.abs(keys).max() >= LIMIT:
             reach_m = LIMIT * self._resolution_m
             raise InputError(f"no surface within {reach_m:g} m; choose a larger --resolution")
@@ -110,6 +125,25 @@ def _packed(cells: NDArray) -> Ints:
     """A number (N,) for each voxel (N, 3)."""
     x, y, z = (np.clip(cells, -_OFFSET, _OFFSET - 1).astype(np.int64) + _OFFSET).T
     return x << 2 * _BITS | y << _BITS | z
+
+
+def _unpacked(codes: Ints) -> Ints:
+    """The voxels (N, 3) of their numbers (N,)."""
+    shifts = np.array([2 * _BITS, _BITS, 0])
+    return (codes[:, None] >> shifts & ((1 << _BITS) - 1)) - _OFFSET
+
+
+def agreed(maps: Sequence[VoxelMap]) -> VoxelMap:
+    """Maps of one frame as one: a voxel is occupied where that is likelier by all that saw it.
+
+    Odds of independent observations multiply, with OctoMap's probabilities of a hit and of a miss
+    (Hornung et al., OctoMap, Autonomous Robots 2013): what has gone, as a person, becomes free.
+    """
+    codes = np.concatenate([_packed(voxels.keys) for voxels in maps])
+    occupied = np.concatenate([voxels.occupied for voxels in maps])
+    known, places = np.unique(codes, return_inverse=True)
+    odds = np.bincount(places, np.where(occupied, HIT, MISS), len(known))
+    return VoxelMap(maps[0].resolution_m, maps[0].T_map_world, _unpacked(known), odds > 0)
 
 
 @dataclass(frozen=True, eq=False)

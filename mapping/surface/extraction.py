@@ -146,9 +146,9 @@ def _copy(
     volume: SurfaceVolume, rows: Ints, cells: _Cells, to: tuple[Ints | slice, ...], least: float
 ) -> None:
     """Copy the voxels of the blocks ``rows`` to where ``to`` says."""
-    part = tuple(slice(0, s.stop - s.start) for s in to[1:] if isinstance(s, slice))
+    edges = [s.stop - s.start for s in to[1:] if isinstance(s, slice)]
     distance, weight, witnesses, free = (
-        _voxels(table, rows)[(slice(None), *part)]
+        _voxels(table, rows, edges)
         for table in (volume.distance, volume.weight, volume.witnesses, volume.free)
     )
     far = np.abs(distance) > (COLOUR_VOXELS - 0.5) * volume.voxel_m
@@ -156,17 +156,21 @@ def _copy(
     known = (weight > 0) & (sure | far)
     cells.distance[to] = np.where(known, distance, np.nan)
     cells.weight[to], cells.witnesses[to] = weight, witnesses
-    cells.colour[to] = _voxels(volume.colour, rows)[(slice(None), *part)]
+    cells.colour[to] = _voxels(volume.colour, rows, edges)
 
 
-def _voxels(table: Tensor, blocks: Ints) -> NDArray[np.float32]:
-    """Values (M, 8, 8, 8, ...) of blocks (M,) in the volume's order of bricks."""
+def _voxels(table: Tensor, blocks: Ints, edges: list[int]) -> NDArray[np.float32]:
+    """Values (M, *edges, ...) of blocks (M,) in the volume's order of bricks.
+
+    ``edges`` are 8, for all voxels along an axis, or 1, for the first.
+    """
     rest = table.shape[2:]
     half = EDGE // BRICK
     values = table.reshape(-1, half, half, half, BRICK, BRICK, BRICK, *rest)
-    chosen = values[torch.from_numpy(blocks)].to(torch.float32)
+    part = [slice(None if edge == EDGE else 1) for edge in edges]
+    chosen = values[(slice(None), *part, *part)][torch.from_numpy(blocks)].to(torch.float32)
     order = (0, 1, 4, 2, 5, 3, 6, *range(7, chosen.ndim))
-    return np.asarray(chosen.permute(order).reshape(-1, EDGE, EDGE, EDGE, *rest).numpy())
+    return np.asarray(chosen.permute(order).reshape(-1, *edges, *rest).numpy())
 
 
 def _vertices(cells: _Cells, voxel_m: float) -> tuple[NDArray, ...]:

@@ -21,8 +21,8 @@ from bmask_slam.semantics.segmenters.segmenter import Segmenter, check_image
 
 logger = logging.getLogger(__name__)
 
-START_TIMEOUT_S = 60.0
-"""Limit for the start of the segmenter there."""
+START_TIMEOUT_S = 300.0
+"""Limit for the start of the segmenter there; a busy machine needs minutes to load a network."""
 IMAGE_TIMEOUT_S = 15.0
 """Limit for one image, transfer both ways included."""
 
@@ -63,7 +63,7 @@ class RaySegmenter:
         errors = self._ray.exceptions
         try:
             if self._actor is None:
-                self._actor = self._start()
+                self._actor, timeout_s = self._start(), START_TIMEOUT_S
             result = getattr(self._actor, method).remote(*arguments)
             return self._ray.get(result, timeout=timeout_s)
         except errors.RayTaskError as error:

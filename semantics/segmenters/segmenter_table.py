@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from bmask_slam.graph.data_files import data_path
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.extras import import_extra
 from bmask_slam.semantics.labels import read_label_set
 from bmask_slam.semantics.segmenters.own_class import OwnClass, names_class, own_segmenter
@@ -95,7 +95,8 @@ def make_segmenter(
     own = names_class(options.name)
     if not own and options.name not in NAMES:
         known = f"{', '.join(NAMES)}, or module:Class"
-        raise InputError(f"segmenter {options.name!r}: not known; there are: {known}")
+        near = did_you_mean(options.name, NAMES)
+        raise InputError(f"segmenter {options.name!r}: not known; there are: {known}{near}")
     if options.name == "none":
         return NoSegmenter()
     if options.ray:

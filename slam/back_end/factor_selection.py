@@ -28,7 +28,7 @@ class FactorSelectionConfig:
     max_observations: int = 200
     min_views: int = 2
     bucket_px: int = 60
-    full_keyframes: int = 300
+    full_keyframes: int = 100
     window_keyframes: int = 20
     window_min_shared: int = 15
     marginalise_batch: int = 100

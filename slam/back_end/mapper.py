@@ -283,11 +283,12 @@ class Mapper:
     def _cull_keyframe(self, newest: Keyframe) -> None:
         """Remove the youngest redundant keyframe around the newest one.
 
-        Landmarks that too few others see are removed with it. Older keyframes are kept: the map
-        would drift if newer views replaced them.
+        Landmarks that too few others see are removed with it. Older keyframes are kept, since the
+        map would drift if newer views replaced them, and so are those that hold factors.
         """
         _, landmark_ids = self.world.observed(newest)
-        kept = self.loops.ends | {0} | self.smoother.tables.own_keyframes  # they hold factors
+        tables = self.smoother.tables
+        kept = self.loops.ends | {0} | tables.own_keyframes | tables.marginalised.bases
         near = {k.id: k for _, k in self.world.covisible(landmark_ids, 15)}
         old = [near[i] for i in sorted(near.keys() - kept, reverse=True) if i < newest.id - 2]
         redundant = redundant_keyframe(self.world, old, self._mapping)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -124,6 +125,27 @@ def format_calibration(done: Calibrated) -> str:
         *_statements(done),
     ]
     return "\n".join(lines)
+
+
+def plain_calibration(done: Calibrated) -> dict[str, Any]:
+    """Values before and after by parameter, with one sigma, as plain values; SI units and pixels.
+
+    The depth scale stands in place of its factor, as in the table.
+    """
+    before, after, sigmas = _of(done.before), _of(done.camera), done.sigmas.copy()
+    sigmas[FACTOR] *= after[FACTOR]
+    parameters = {
+        "depth_scale" if i == FACTOR else name: {
+            "before": before[i],
+            "after": after[i],
+            "sigma": sigmas[i] if done.prior_sigmas[i] else None,
+            "verdict": _verdict(done, i),
+        }
+        for i, name in enumerate(PARAMETERS)
+    }
+    names = ("keyframes", "landmarks", "observations")
+    counts = {name: getattr(done, name) for name in names}
+    return {"camera": done.path, "parameters": parameters, **counts}
 
 
 def _residual(done: Calibrated) -> str:

@@ -1,11 +1,12 @@
-"""Arguments that several commands share: configuration, segmenter, viewer."""
+"""What several commands share: arguments of configuration, segmenter and viewer; the output."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
     from bmask_slam.evaluation import Row
@@ -25,10 +26,35 @@ DETAILS = (
 SEGMENTERS = "light, mask-scoring-rcnn, precomputed, truth, none, or module:Class of your own"
 
 
+def add_output_arguments(parser: argparse.ArgumentParser, short: str) -> None:
+    """Add --quiet, which prints only ``short``, and --json."""
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--quiet", action="store_true", help=f"print only {short}")
+    how.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def print_result(
+    arguments: argparse.Namespace,
+    short: object,
+    text: Callable[[], str],
+    result: Mapping[str, Any],
+) -> None:
+    """Print ``short`` if --quiet was given, the result as JSON if --json was, else the text."""
+    from bmask_slam.graph.files.json_file import format_json
+
+    print(short if arguments.quiet else format_json(result) if arguments.json else text())
+
+
 def add_camera_argument(parser: argparse.ArgumentParser) -> None:
     """Add --camera."""
     text = "camera.yaml in place of its own, or a model such as kinect-v1 for what that leaves out"
     parser.add_argument("--camera", type=Path, metavar="F", help=text)
+
+
+def add_mesh_voxel_argument(parser: argparse.ArgumentParser) -> None:
+    """Add --mesh-voxel."""
+    text = "edge of the dense surface's voxels; 0.03: a quick preview (default: 0.01)"
+    parser.add_argument("--mesh-voxel", dest="mesh_voxel_m", type=float, metavar="M", help=text)
 
 
 def add_topic_arguments(parser: argparse.ArgumentParser) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bmask_slam.commands.arguments import Commands
+from bmask_slam.commands.arguments import Commands, add_output_arguments, print_result
 
 TEXT = "calibrate the camera of a run from its own observations, and write camera.yaml"
 MORE = """\
@@ -45,7 +45,7 @@ def add_calibrate(commands: Commands) -> None:
         metavar="N",
         help="calibrate up to N times, until nothing changes by more than its sigma (default: 1)",
     )
-    parser.add_argument("--quiet", action="store_true", help="print only the file's path")
+    add_output_arguments(parser, "the file's path")
 
 
 def _add_metric_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,9 +72,8 @@ def _add_metric_arguments(parser: argparse.ArgumentParser) -> None:
 def _calibrate(arguments: argparse.Namespace) -> int:
     from bmask_slam.calibration.calibrate import CalibrateOptions
     from bmask_slam.calibration.priors import CalibrationPriors
-    from bmask_slam.calibration.report import format_calibration
+    from bmask_slam.calibration.report import format_calibration, plain_calibration
     from bmask_slam.offline.calibration_rounds import calibrate_in_rounds
-    from bmask_slam.runtime.progress import console_log
 
     known = arguments.known_distance
     options = CalibrateOptions(
@@ -89,7 +88,9 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         priors=CalibrationPriors(k3=0.2 if arguments.k3 else 0.0),
         overwrite=arguments.overwrite,
     )
-    with console_log():
-        done = calibrate_in_rounds(options, arguments.rounds, arguments.quiet)
-    print(done.path if arguments.quiet else f"{format_calibration(done)}\n\nCamera  {done.path}")
+    done = calibrate_in_rounds(options, arguments.rounds, arguments.quiet)
+    told = plain_calibration(done)
+    print_result(
+        arguments, done.path, lambda: f"{format_calibration(done)}\n\nCamera  {done.path}", told
+    )
     return 0

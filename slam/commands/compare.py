@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bmask_slam.commands.arguments import Commands
+from bmask_slam.commands.arguments import Commands, add_output_arguments, print_result
 from bmask_slam.graph.errors import InputError
 
 if TYPE_CHECKING:
@@ -46,7 +46,8 @@ def add_compare(commands: Commands) -> None:
     )
     parser.add_argument(
         "--trajectory", action="append", default=[], metavar="METHOD:SEQUENCE=FILE",
-        help="another system's trajectory, in TUM format; SEQUENCE@SEED of a rendered one",
+        help="another system's trajectory, in TUM format; SEQUENCE@SEED of a rendered one; "
+        "METHOD:*=PATTERN, as results/{sequence}*.txt, for all",
     )  # fmt: skip
     parser.add_argument("--sequences", metavar="A,B", help="only these")
     parser.add_argument("--configurations", metavar="A,B", help="only these")
@@ -54,22 +55,23 @@ def add_compare(commands: Commands) -> None:
     parser.add_argument("--jobs", type=int, metavar="N", help="at a time (default: one a core)")
     parser.add_argument("--ray", metavar="ADDRESS", help="run on a Ray cluster: address, or auto")
     parser.add_argument("--with-scale", action="store_true", help="align by Sim(3): monocular")
-    parser.add_argument("--quiet", action="store_true", help="print only the folder's path")
+    add_output_arguments(parser, "the folder's path")
 
 
 def _compare(arguments: argparse.Namespace) -> int:
     from bmask_slam.comparison.comparing import compare
     from bmask_slam.comparison.experiment.experiment_file import find_experiment
     from bmask_slam.comparison.experiment.result import CellStatus
+    from bmask_slam.comparison.statistics import verdicts
     from bmask_slam.comparison.text import format_comparison
-    from bmask_slam.runtime.progress import console_log
 
     name = find_experiment(arguments.experiment).stem
     out = arguments.out or Path("runs") / f"compare-{name}"
-    with console_log():
-        comparison = compare(arguments.experiment, out, _options(arguments))
-    text = f"{format_comparison(comparison)}\n\nReport  {out / 'report.html'}"
-    print(out if arguments.quiet else text)
+    comparison = compare(arguments.experiment, out, _options(arguments))
+    page = out / "report.html"
+    told = {"folder": out, "report": page, "verdicts": verdicts(comparison)}
+    told |= {"sequences": comparison.sequences, "cells": comparison.cells}
+    print_result(arguments, out, lambda: f"{format_comparison(comparison)}\n\nReport  {page}", told)
     return int(any(cell.status is CellStatus.FAILED for cell in comparison.cells))
 
 

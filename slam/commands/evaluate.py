@@ -27,16 +27,14 @@ def add_evaluate(commands: Commands) -> None:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     from bmask_slam.evaluation import evaluate, format_json, format_table
-    from bmask_slam.runtime.progress import console_log
 
-    with console_log():
-        result = evaluate(
-            arguments.run_or_trajectory,
-            arguments.reference,
-            arguments.plot,
-            arguments.with_scale,
-            arguments.times,
-            arguments.hand_eye,
-        )
+    result = evaluate(
+        arguments.run_or_trajectory,
+        arguments.reference,
+        arguments.plot,
+        arguments.with_scale,
+        arguments.times,
+        arguments.hand_eye,
+    )
     print(format_json(result.rows) if arguments.json else format_table(result.rows))
     return 0

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bmask_slam.commands.arguments import (
     Commands,
     add_camera_argument,
     add_config_arguments,
+    add_mesh_voxel_argument,
+    add_output_arguments,
     add_segmenter_arguments,
     add_topic_arguments,
     add_view_arguments,
     bag_topics,
     chosen_config,
     format_summary,
+    print_result,
     view_options,
 )
 from bmask_slam.graph.errors import InputError
@@ -26,6 +31,7 @@ if TYPE_CHECKING:
     from bmask_slam.live.live_slam import LiveOptions, LiveSlam
     from bmask_slam.live.play import Listener
     from bmask_slam.live.sources.opening import SourceOptions
+    from bmask_slam.live.sources.ros2_source import Ros2Source
     from bmask_slam.live.sources.source import Source
     from bmask_slam.system_config import SystemConfig
 
@@ -59,10 +65,11 @@ def add_live(commands: Commands) -> None:
     parser.add_argument("--calibrate", default="auto", metavar="auto|off|report", help=text)
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
     parser.add_argument("--map", action="store_true", help="also a dense map, as by bmask-slam map")
+    add_mesh_voxel_argument(parser)
     add_segmenter_arguments(parser, "light")
     parser.add_argument("--view", action="store_true", help="show it in Rerun's window")
     add_view_arguments(parser)
-    parser.add_argument("--quiet", action="store_true", help="print only the run folder's path")
+    add_output_arguments(parser, "the run folder's path")
 
 
 def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,7 +83,7 @@ def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_topic_arguments(parser)
     for sensor in SENSORS:
-        text = f"of a bag: {sensor}, with its sensors.{sensor} settings (default: none)"
+        text = f"of a bag or ros2: {sensor}, with its sensors.{sensor} settings (default: none)"
         parser.add_argument(f"--{sensor}-topic", metavar="T", default="", help=text)
     text = "of ros2: frames, topics and the camera's place on the robot, as YAML"
     parser.add_argument("--ros2-params", type=Path, metavar="F", help=text)
@@ -86,8 +93,12 @@ def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
 
 def source_options(arguments: argparse.Namespace) -> SourceOptions:
     """How the source is to be read."""
-    from bmask_slam.live.sources.opening import SourceOptions
+    from bmask_slam.live.sources.opening import ROS2, SourceOptions
+    from bmask_slam.sequences.bags.sensors import SensorTopics
 
+    sensors = SensorTopics()
+    if arguments.source.startswith(ROS2):
+        sensors = SensorTopics(**_sensor_topics(arguments))
     return SourceOptions(
         camera=arguments.camera,
         realtime=arguments.realtime,
@@ -96,30 +107,42 @@ def source_options(arguments: argparse.Namespace) -> SourceOptions:
         silence_s=arguments.silence,
         topics=bag_topics(arguments),
         reliable=arguments.reliable,
+        sensors=sensors,
     )
+
+
+def _sensor_topics(arguments: argparse.Namespace) -> dict[str, str]:
+    return {sensor: getattr(arguments, f"{sensor}_topic") for sensor in SENSORS}
 
 
 def _live(arguments: argparse.Namespace) -> int:
     from bmask_slam.live.live_slam import LiveSlam
     from bmask_slam.live.play import PlayOptions, play
-    from bmask_slam.live.sources.opening import open_source
-    from bmask_slam.runtime.progress import console_log
+    from bmask_slam.live.sources.opening import open_source, ros2_of
 
     config = chosen_config(arguments).config
-    with console_log(), closing(open_source(arguments.source, source_options(arguments))) as source:
-        options = _live_options(arguments, source)
+    with closing(open_source(arguments.source, source_options(arguments))) as source:
+        options, ros2 = _live_options(arguments, source), ros2_of(source)
+        if ros2 is not None:
+            config = replace(config, sensors=ros2.mounted(config.sensors))
         with LiveSlam(source.camera, config, options) as slam:
             slam.source_counts = source.counts
+            if ros2 is not None:
+                ros2.deliver = slam.add_measurements
             for measured in measured_beside(arguments, options.images, config):
                 slam.add_measurements(measured)
             if slam.viewer_url:
-                print(f"in a browser: {slam.viewer_url}", flush=True)
+                print(f"in a browser: {slam.viewer_url}", file=sys.stderr, flush=True)
             told = PlayOptions(not source.waits, quiet=arguments.quiet)
-            ended_by = play(slam, source, told, ros2_listener(arguments, source))
-    if arguments.quiet:
-        print(slam.out)
-    else:
-        _print_summary(slam, source)
+            ended_by = play(slam, source, told, ros2_listener(arguments, ros2))
+    found: dict[str, Any] = {
+        "folder": slam.out,
+        "calibration": slam.calibration,
+        "source": source.counts.line(),
+    }
+    found |= {"stopped_by": ended_by or None, "metrics": slam.rows}
+    found |= {"dense_points": None if slam.dense is None else slam.dense.points}
+    print_result(arguments, slam.out, lambda: _summary(slam, source), found)
     return 128 + ended_by if ended_by else 0
 
 
@@ -128,10 +151,13 @@ def measured_beside(
 ) -> list[Measurements]:
     """What other sensors measured, from the files of a folder or the topics of a bag."""
     from bmask_slam.graph.sensors.streams import read_folder
-    from bmask_slam.live.bag_sensors import SensorTopics, read_sensors
+    from bmask_slam.live.sources.opening import ROS2
     from bmask_slam.sequences.bags.bag_file import is_bag
+    from bmask_slam.sequences.bags.sensors import SensorTopics, read_sensors
 
-    topics = {sensor: getattr(arguments, f"{sensor}_topic") for sensor in SENSORS}
+    if arguments.source.startswith(ROS2):
+        return []  # they come as the frames do
+    topics = _sensor_topics(arguments)
     given = [f"--{sensor}-topic" for sensor, topic in topics.items() if topic]
     path = Path(arguments.source)
     if given and not is_bag(path):
@@ -143,18 +169,35 @@ def measured_beside(
     )
 
 
-def ros2_listener(arguments: argparse.Namespace, source: Source) -> Listener | None:
+def ros2_listener(arguments: argparse.Namespace, source: Ros2Source | None) -> Listener | None:
     """What publishes the results, where the frames come from ROS 2."""
     from bmask_slam.config.configuration import resolve
-    from bmask_slam.live.ros2.outputs import Ros2Frames, Ros2Publisher
+    from bmask_slam.live.ros2.outputs import OPTICAL, Robot, Ros2Frames
+    from bmask_slam.live.ros2.publisher import Ros2Publisher
 
-    node = getattr(source, "node", None)
-    return None if node is None else Ros2Publisher(node, resolve(Ros2Frames, arguments.ros2_params))
+    if source is None:
+        return None
+    frames = resolve(Ros2Frames, arguments.ros2_params)
+    T, by_tf = frames.T_base_camera, False
+    if T is None:
+        T = source.T_base_camera(frames.base)
+        by_tf = T is not None
+    wheels = "odometry" in source.sensors.names
+    robot = Robot(
+        OPTICAL if T is None else T,
+        T is not None,
+        by_tf,
+        source.sensors.T_odom_base if wheels else None,
+        source.ros_time,
+    )
+    return Ros2Publisher(source.node, frames, robot)
 
 
 def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
     """Where the run is written, and what the source says about itself."""
     from bmask_slam.live.live_slam import LiveOptions
+    from bmask_slam.live.ros2.grid import POINTS
+    from bmask_slam.live.sources.opening import ros2_of
     from bmask_slam.run_folder.open_files import free_run_path
     from bmask_slam.sequences.bags.bag_file import is_bag
     from bmask_slam.sequences.formats.layouts import is_recording_file
@@ -171,18 +214,21 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
         images=recording,
         title=source.name,
         dense=arguments.map,
+        mesh_voxel_m=arguments.mesh_voxel_m,
+        submap_points=POINTS if ros2_of(source) is not None else 0,
         calibrate=arguments.calibrate,
         straightens=True,
         interpolates=source.interpolates,
     )
 
 
-def _print_summary(slam: LiveSlam, source: Source) -> None:
-    print(format_summary(slam.rows))
+def _summary(slam: LiveSlam, source: Source) -> str:
+    lines = [format_summary(slam.rows)]
     if slam.calibration:
-        print(f"\nCamera      {slam.calibration}")
-    print(f"\nRun folder  {slam.out}")
+        lines.append(f"\nCamera      {slam.calibration}")
+    lines.append(f"\nRun folder  {slam.out}")
     if slam.dense is not None:
-        print(f"Dense map   {slam.out}/dense, {slam.dense.points} points")
+        lines.append(f"Dense map   {slam.out}/dense, {slam.dense.points} points")
     if counts := source.counts.line():
-        print(f"Source      {counts}")
+        lines.append(f"Source      {counts}")
+    return "\n".join(lines)

@@ -6,7 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bmask_slam.commands.arguments import Commands, add_segmenter_arguments, segmenter_options
+from bmask_slam.commands.arguments import (
+    Commands,
+    add_mesh_voxel_argument,
+    add_output_arguments,
+    add_segmenter_arguments,
+    print_result,
+    segmenter_options,
+)
 
 if TYPE_CHECKING:
     from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
@@ -35,6 +42,7 @@ def add_map(commands: Commands) -> None:
     parser.add_argument(
         "--voxel", type=float, default=0.01, metavar="M", help="a point a cube (default: 0.01)"
     )
+    add_mesh_voxel_argument(parser)
     parser.add_argument("--mesh", action="store_true", help="also a mesh (mesh.ply, mesh.glb)")
     parser.add_argument("--plan", action="store_true", help="also a floor plan (plan.png)")
     add_segmenter_arguments(parser, "the run's own")
@@ -59,13 +67,13 @@ def add_map(commands: Commands) -> None:
         "what moved since",
     )
     parser.add_argument("--device", default="cpu", help="where depth is fused (default: cpu)")
-    parser.add_argument("--quiet", action="store_true", help="print only the folder's path")
+    add_output_arguments(parser, "the folder's path")
 
 
 def _map(arguments: argparse.Namespace) -> int:
     from bmask_slam.dense.map_run import format_summary, map_run
     from bmask_slam.dense.options import MapOptions
-    from bmask_slam.runtime.progress import console_log, counting_bar
+    from bmask_slam.runtime.progress import counting_bar
 
     without = arguments.without
     options = MapOptions(
@@ -75,15 +83,20 @@ def _map(arguments: argparse.Namespace) -> int:
         excluded=None if without is None else tuple(filter(None, without.split(","))),
         keep_excluded=arguments.moving,
         voxel_m=arguments.voxel,
+        mesh_voxel_m=arguments.mesh_voxel_m,
         source=arguments.depth_source,
         device=arguments.device,
         mesh=arguments.mesh,
         plan=arguments.plan,
         keep_volume=arguments.keep_volume,
     )
-    with console_log(), counting_bar(arguments.quiet) as progress:
+    with counting_bar(arguments.quiet) as progress:
         summary = map_run(options, progress)
-    print(summary.folder if arguments.quiet else format_summary(summary))
+    counts, products = summary.counts, summary.products
+    told = {"folder": summary.folder, "fused": counts.fused, "reused": counts.reused}
+    told |= {"skipped": counts.skipped, "files": products.files, "points": products.points}
+    told |= {"label_shares": products.label_shares}
+    print_result(arguments, summary.folder, lambda: format_summary(summary), told)
     return 0
 
 
@@ -107,16 +120,15 @@ def add_merge(commands: Commands) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="F", help="run folder to make")
     text = "replace the run that --out holds; never an input"
     parser.add_argument("--overwrite", action="store_true", help=text)
-    parser.add_argument("--quiet", action="store_true", help="print only the folder's path")
+    add_output_arguments(parser, "the folder's path")
 
 
 def _merge(arguments: argparse.Namespace) -> int:
     from bmask_slam.merging.merge import MergeOptions, merge_runs
     from bmask_slam.merging.report import format_merge
-    from bmask_slam.runtime.progress import console_log
 
     options = MergeOptions(tuple(arguments.runs), arguments.out, arguments.overwrite)
-    with console_log():
-        summary = merge_runs(options)
-    print(summary.folder if arguments.quiet else format_merge(summary))
+    summary = merge_runs(options)
+    told = {"folder": summary.folder, "found": summary.lines, "metrics": summary.rows}
+    print_result(arguments, summary.folder, lambda: format_merge(summary), told)
     return 0

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-from bmask_slam.commands.arguments import Commands
+from bmask_slam.commands.arguments import Commands, add_output_arguments, print_result
 from bmask_slam.graph.errors import InputError
 
 if TYPE_CHECKING:
+    from bmask_slam.graph.batch.bundle_adjustment import Adjustment
     from bmask_slam.graph.batch.iteration import Progress
     from bmask_slam.graph.pose_graph.optimisation import Method
 
+_Told: TypeAlias = tuple[str, dict[str, Any]]
+"""The result as text, and by name for --json."""
 TEXT = "optimise a run folder or a graph in g2o format, offline"
 MORE = """\
 A run folder gets a full bundle adjustment of poses and landmarks, wrong loops and wrong
@@ -37,7 +40,7 @@ def add_optimise(commands: Commands) -> None:
         metavar="F",
         help="run folder or g2o file to write; of a folder: one for all",
     )
-    parser.add_argument("--quiet", action="store_true", help="print only the output's path")
+    add_output_arguments(parser, "the output's path")
     _add_graph_options(parser)
     _add_run_options(parser)
     parser.add_argument(
@@ -86,7 +89,7 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
 
 def _optimise(arguments: argparse.Namespace) -> int:
     from bmask_slam.comparison.optimise_folder import is_run_folder
-    from bmask_slam.runtime.progress import console_log, iteration_bar
+    from bmask_slam.runtime.progress import iteration_bar
 
     if arguments.input.is_dir() and not is_run_folder(arguments.input):
         return _folder(arguments)
@@ -96,9 +99,9 @@ def _optimise(arguments: argparse.Namespace) -> int:
             f"{arguments.input}"
         )
     work = _run_folder if arguments.input.is_dir() else _file
-    with console_log(), iteration_bar(arguments.quiet) as progress:
-        text = work(arguments, progress)
-    print(arguments.out if arguments.quiet else text)
+    with iteration_bar(arguments.quiet) as progress:
+        text, told = work(arguments, progress)
+    print_result(arguments, arguments.out, lambda: text, {"out": arguments.out} | told)
     return 0
 
 
@@ -109,7 +112,6 @@ def _folder(arguments: argparse.Namespace) -> int:
         format_folder,
         optimise_folder,
     )
-    from bmask_slam.runtime.progress import console_log
 
     for option in ("reference", "overwrite", "plot"):
         if getattr(arguments, option):
@@ -118,13 +120,13 @@ def _folder(arguments: argparse.Namespace) -> int:
     more += tuple(f"--{name}" for name in ("repair", "certify") if getattr(arguments, name))
     quiet = arguments.quiet
     names = (arguments.input, arguments.out, more, arguments.jobs, arguments.ray, quiet)
-    with console_log():
-        done = optimise_folder(FolderOptions(*names))
-    print(arguments.out if quiet else format_folder(done))
+    done = optimise_folder(FolderOptions(*names))
+    told = {"out": arguments.out, "inputs": {job.name: outcome for job, outcome in done}}
+    print_result(arguments, arguments.out, lambda: format_folder(done), told)
     return 0 if all(outcome.status is CellStatus.DONE for _, outcome in done) else 1
 
 
-def _run_folder(arguments: argparse.Namespace, progress: Progress) -> str:
+def _run_folder(arguments: argparse.Namespace, progress: Progress) -> _Told:
     from bmask_slam.refinement.adjustment import AdjustOptions, adjust_run, format_run_adjustment
 
     _refuse_method(arguments, "a run folder")
@@ -133,13 +135,16 @@ def _run_folder(arguments: argparse.Namespace, progress: Progress) -> str:
     names = ("out", "overwrite", "reference", "plot")
     given = {name: getattr(arguments, name) for name in names}
     result = adjust_run(AdjustOptions(arguments.input, **given), progress=progress)
-    return (
+    text = (
         f"{format_run_adjustment(result)}\n\nRun folder              {result.folder}\n"
         f"Picture                 {result.picture}"
     )
+    before, after = ([] if e is None else e.rows for e in result.errors or (None, None))
+    errors = {"metrics_before": before, "metrics_after": after}
+    return text, _plain_adjustment(result.adjustment) | errors | {"picture": result.picture}
 
 
-def _file(arguments: argparse.Namespace, progress: Progress) -> str:
+def _file(arguments: argparse.Namespace, progress: Progress) -> _Told:
     from bmask_slam.graph.g2o.landmark_graphs import has_landmarks
     from bmask_slam.refinement.adjustment import format_adjustment
     from bmask_slam.refinement.optimise import (
@@ -156,13 +161,25 @@ def _file(arguments: argparse.Namespace, progress: Progress) -> str:
     if has_landmarks(arguments.input):
         _refuse_method(arguments, "a graph with landmarks")
         adjusted = adjust_file(*paths, arguments.plot, arguments.repair, progress)
-        text = format_adjustment(*adjusted)
+        text, told = format_adjustment(*adjusted), _plain_adjustment(adjusted[0])
     else:
         method: Method = arguments.method or "lm"
         options = GraphOptions(method, arguments.repair, arguments.certify, arguments.plot)
-        text = format_result(*optimise_file(*paths, options, progress))
+        result, certificate = optimise_file(*paths, options, progress)
+        text = format_result(result, certificate)
+        names = ("method", "start", "initial_cost", "final_cost", "iterations", "duration_ms")
+        told = {name: getattr(result, name) for name in names}
+        told |= {"outliers": int(result.is_outlier.sum()), "certificate": certificate}
     picture = f"\nPicture        {arguments.plot}" if arguments.plot else ""
-    return f"{text}\n\nGraph          {arguments.out}{picture}"
+    return f"{text}\n\nGraph          {arguments.out}{picture}", told
+
+
+def _plain_adjustment(done: Adjustment) -> dict[str, Any]:
+    """What --json prints of a bundle adjustment."""
+    numbers = {"wrong_loops": len(done.wrong_loops), "loops": done.loops}
+    numbers |= {"wrong_observations": len(done.wrong_observations)}
+    numbers |= {"observations": done.observations}
+    return {"stages": done.stages, **numbers, "duration_ms": done.duration_ms}
 
 
 def _refuse_method(arguments: argparse.Namespace, what: str) -> None:

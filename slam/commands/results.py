@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 
-from bmask_slam.commands.arguments import Commands
+from bmask_slam.commands.arguments import Commands, add_output_arguments, print_result
 
 MOST = 10
 DRIVE = ("nav2", "octomap")
@@ -85,29 +86,28 @@ def add_export(commands: Commands) -> None:
     parser.add_argument(
         "--heights", nargs=2, type=float, default=(0.1, 1.5), metavar=("LOW", "HIGH"), help=text
     )
-    parser.add_argument("--quiet", action="store_true", help="print only the paths")
+    add_output_arguments(parser, "the paths")
 
 
 def _export_drive_map(arguments: argparse.Namespace) -> int:
     from bmask_slam.dense.drive_map import DriveMapOptions, export_drive_map
-    from bmask_slam.runtime.progress import console_log
 
     options = DriveMapOptions(arguments.resolution, *arguments.heights)
-    with console_log():
-        files, text = export_drive_map(arguments.input, arguments.format, arguments.out, options)
-    print("\n".join(map(str, files)) + ("" if arguments.quiet else f"\n\n{text}"))
-    return 0
+    files, text = export_drive_map(arguments.input, arguments.format, arguments.out, options)
+    return _print_exported(arguments, files, text)
 
 
 def _export(arguments: argparse.Namespace) -> int:
     if arguments.format in DRIVE:
         return _export_drive_map(arguments)
     from bmask_slam.run_folder.export import export
-    from bmask_slam.runtime.progress import console_log
 
-    with console_log():
-        exported = export(arguments.input, arguments.format, arguments.out, arguments.times)
-    print("\n".join(str(path) for path in exported.files))
-    if not arguments.quiet:
-        print(f"\n{exported.contents}")
+    exported = export(arguments.input, arguments.format, arguments.out, arguments.times)
+    return _print_exported(arguments, exported.files, exported.contents)
+
+
+def _print_exported(arguments: argparse.Namespace, files: Iterable[Path], contents: str) -> int:
+    paths = "\n".join(map(str, files))
+    told = {"files": list(files), "contents": contents}
+    print_result(arguments, paths, lambda: f"{paths}\n\n{contents}", told)
     return 0

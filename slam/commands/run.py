@@ -11,11 +11,14 @@ from bmask_slam.commands.arguments import (
     Commands,
     add_camera_argument,
     add_config_arguments,
+    add_mesh_voxel_argument,
+    add_output_arguments,
     add_segmenter_arguments,
     add_topic_arguments,
     bag_topics,
     chosen_config,
     format_summary,
+    print_result,
 )
 from bmask_slam.graph.errors import InputError
 
@@ -41,6 +44,7 @@ OPTIONS = (
     "localise",
     "calibrate",
     "dense",
+    "mesh_voxel_m",
 )
 
 
@@ -71,7 +75,7 @@ def add_run(commands: Commands) -> None:
     _add_map_arguments(parser)
     add_segmenter_arguments(parser, "light")
     add_topic_arguments(parser)
-    parser.add_argument("--quiet", action="store_true", help="print only the run folder's path")
+    add_output_arguments(parser, "the run folder's path")
 
 
 def _add_map_arguments(parser: argparse.ArgumentParser) -> None:
@@ -87,6 +91,7 @@ def _add_map_arguments(parser: argparse.ArgumentParser) -> None:
     )
     text = "also a dense map, as by bmask-slam map"
     parser.add_argument("--map", dest="dense", action="store_true", default=None, help=text)
+    add_mesh_voxel_argument(parser)
     parser.add_argument(
         "--covariances",
         dest="set",
@@ -98,18 +103,18 @@ def _add_map_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     from bmask_slam.config.configuration import dump
-    from bmask_slam.runtime.progress import console_log
 
     chosen = chosen_config(arguments)
     if arguments.print_config:
         print(dump(chosen.config), end="")
         return 0
-    with console_log():
-        summary = _run_or_resume(arguments, chosen)
+    summary = _run_or_resume(arguments, chosen)
     if summary is None:
-        print(arguments.resume if arguments.quiet else f"{arguments.resume} is finished already")
+        path = arguments.resume
+        told = {"folder": path, "finished": True, "metrics": []}
+        print_result(arguments, path, lambda: f"{path} is finished already", told)
         return 0
-    _print_summary(summary, arguments.quiet)
+    print_result(arguments, summary.folder, lambda: _summary(summary), _plain_summary(summary))
     return 128 + summary.stopped_by if summary.stopped_by else 0
 
 
@@ -133,19 +138,26 @@ def _run_or_resume(arguments: argparse.Namespace, chosen: ChosenConfig) -> RunSu
     return run(RunOptions(**given, overwrite=arguments.overwrite))
 
 
-def _print_summary(summary: RunSummary, quiet: bool) -> None:
-    if quiet:
-        print(summary.folder)
-        return
-    print(format_summary(summary.rows))
+def _plain_summary(summary: RunSummary) -> dict[str, Any]:
+    """What --json prints."""
+    stopped_by = summary.stopped_by.name if summary.stopped_by else None
+    told = {"folder": summary.folder, "finished": not summary.resumable, "stopped_by": stopped_by}
+    names = ("frames", "skipped", "calibration", "warnings")
+    told |= {name: getattr(summary, name) for name in names}
+    return told | {"metrics": summary.rows}
+
+
+def _summary(summary: RunSummary) -> str:
+    lines = [format_summary(summary.rows)]
     if summary.calibration:
-        print(f"\nCamera      {summary.calibration}")
-    for warning in summary.warnings:
-        print(f"\nWarning     {warning}")
+        lines.append(f"\nCamera      {summary.calibration}")
+    lines += [f"\nWarning     {warning}" for warning in summary.warnings]
     if summary.skipped:
-        print(f"\n{summary.skipped} broken frames were skipped, see log.txt")
+        lines.append(f"\n{summary.skipped} broken frames were skipped, see log.txt")
     if summary.stopped_by:
-        print(f"\nStopped by {summary.stopped_by.name} after {summary.frames} frames; all is saved")
+        name, frames = summary.stopped_by.name, summary.frames
+        lines.append(f"\nStopped by {name} after {frames} frames; all is saved")
     if summary.resumable:
-        print(f"Go on with  bmask-slam run --resume {summary.folder}")
-    print(f"\nRun folder  {summary.folder}\nPicture     {summary.folder / 'trajectory.png'}")
+        lines.append(f"Go on with  bmask-slam run --resume {summary.folder}")
+    picture = summary.folder / "trajectory.png"
+    return "\n".join([*lines, f"\nRun folder  {summary.folder}", f"Picture     {picture}"])

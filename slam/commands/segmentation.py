@@ -5,7 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bmask_slam.commands.arguments import Commands, add_segmenter_arguments, segmenter_options
+from bmask_slam.commands.arguments import (
+    Commands,
+    add_output_arguments,
+    add_segmenter_arguments,
+    print_result,
+    segmenter_options,
+)
 
 SEGMENT = "find the objects in a sequence's images and keep their masks"
 SEGMENT_MORE = """\
@@ -33,12 +39,12 @@ def add_segment(commands: Commands) -> None:
         "--min-score", type=float, default=0.5, metavar="S", help="class score (default: 0.5)"
     )
     parser.add_argument("--no-overlays", action="store_true", help="masks only, no pictures")
-    parser.add_argument("--quiet", action="store_true", help="print only the file's path")
+    add_output_arguments(parser, "the file's path")
 
 
 def _segment(arguments: argparse.Namespace) -> int:
     from bmask_slam.datasets.weights import find_weights
-    from bmask_slam.runtime.progress import console_log, counting_bar
+    from bmask_slam.runtime.progress import counting_bar
     from bmask_slam.semantics.segmenters.mask_cache import CacheOptions, cache_masks
     from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
     from bmask_slam.sequences.lists import colour_images
@@ -47,16 +53,13 @@ def _segment(arguments: argparse.Namespace) -> int:
     options = segmenter_options(arguments, SegmenterOptions(min_score=arguments.min_score))
     settings = {**options.described(), "source": str(source.resolve())}
     cache = CacheOptions(arguments.out, settings, not arguments.no_overlays)
-    with console_log(), counting_bar(arguments.quiet) as progress:
+    with counting_bar(arguments.quiet) as progress:
         files = colour_images(source)
         result = cache_masks(make_segmenter(options, source, find_weights), files, cache, progress)
-    if arguments.quiet:
-        print(result.file)
-        return 0
-    print(f"{result.instances} instances in {result.images} images, {result.reused} of them reused")
-    if result.broken:
-        print(f"{result.broken} broken images were left out")
-    print(f"Masks       {result.file}")
+    text = f"{result.instances} instances in {result.images} images, {result.reused} of them reused"
+    text += f"\n{result.broken} broken images were left out" if result.broken else ""
+    text += f"\nMasks       {result.file}"
+    print_result(arguments, result.file, lambda: text, vars(result))
     return 0
 
 
@@ -75,11 +78,12 @@ def add_evaluate_segmentation(commands: Commands) -> None:
     parser.add_argument("--plot", type=Path, metavar="F", help="picture of precision and recall")
     parser.add_argument("--curves", type=Path, metavar="F", help="the same as a table (CSV)")
     parser.add_argument("--quiet", action="store_true", help="no bar")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     from bmask_slam.datasets.weights import find_weights
-    from bmask_slam.runtime.progress import console_log, counting_bar
+    from bmask_slam.runtime.progress import counting_bar
     from bmask_slam.semantics.instances.coco_files import read_coco
     from bmask_slam.semantics.segmenters.evaluation import (
         draw_precision_recall,
@@ -91,7 +95,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from bmask_slam.semantics.training.dataset import split
 
     options = segmenter_options(arguments, SegmenterOptions(min_score=0.0))
-    with console_log(), counting_bar(arguments.quiet) as progress:
+    with counting_bar(arguments.quiet) as progress:
         truth = read_coco(arguments.data)
         if arguments.held_out is not None:
             _, truth = split(truth, arguments.held_out, arguments.seed)
@@ -101,7 +105,12 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         draw_precision_recall(result, arguments.plot)
     if arguments.curves:
         write_curves(result, arguments.curves)
-    print(format_segmentation(result))
+    text = format_segmentation(result)
+    told = {k: v for k, v in vars(result).items() if k not in ("curves", "iou_pairs")}
+    told["precision"] = [
+        {k: v for k, v in vars(c).items() if k != "precision"} for c in result.curves
+    ]
+    print_result(arguments, text, lambda: text, told)
     return 0
 
 
@@ -144,13 +153,13 @@ def add_train(commands: Commands) -> None:
         "--rate", type=float, default=5e-4, metavar="R", help="learning rate (5e-4)"
     )
     parser.add_argument("--seed", type=int, default=0, help="of split, batches and augmentation")
-    parser.add_argument("--quiet", action="store_true", help="print only the weights' path")
+    add_output_arguments(parser, "the weights' path")
 
 
 def _train(arguments: argparse.Namespace) -> int:
     from bmask_slam.datasets.weights import find_weights
     from bmask_slam.graph.errors import InputError
-    from bmask_slam.runtime.progress import console_log, counting_bar
+    from bmask_slam.runtime.progress import counting_bar
     from bmask_slam.semantics.training.run import Source, TrainingRun, run_training
 
     if len(arguments.data) != len(arguments.images):
@@ -167,7 +176,7 @@ def _train(arguments: argparse.Namespace) -> int:
     run = TrainingRun(
         data, **given, weights=weights, freeze=tuple(arguments.freeze), settings=settings
     )
-    with console_log(), counting_bar(arguments.quiet) as progress:
+    with counting_bar(arguments.quiet) as progress:
         made = run_training(run, progress)
-    print(made if arguments.quiet else f"Weights     {made}")
+    print_result(arguments, made, lambda: f"Weights     {made}", {"weights": made})
     return 0

@@ -9,8 +9,10 @@ from pathlib import Path
 from bmask_slam.commands.arguments import (
     Commands,
     add_camera_argument,
+    add_output_arguments,
     add_topic_arguments,
     bag_topics,
+    print_result,
 )
 
 CONVERT_MORE = """\
@@ -54,20 +56,21 @@ def add_render(commands: Commands) -> None:
     parser.add_argument("--sensors", default="", metavar="S,S", help=text)
     parser.add_argument("--true-depth", action="store_true", help="also write noise-free depth")
     parser.add_argument("--normals", action="store_true", help="also write surface normals")
-    parser.add_argument("--quiet", action="store_true", help="print only the folder's path")
+    add_output_arguments(parser, "the folder's path")
 
 
 def _render(arguments: argparse.Namespace) -> int:
     from bmask_slam.rendering.sequence import RenderConfig, render_sequence
-    from bmask_slam.runtime.progress import console_log, counting_bar
+    from bmask_slam.runtime.progress import counting_bar
 
     names = (f.name for f in fields(RenderConfig) if f.name != "noise")
     given = {name: getattr(arguments, name) for name in names}
     given["sensors"] = tuple(filter(None, arguments.sensors.split(",")))
     config = RenderConfig(noise=not arguments.no_noise, **given)
-    with console_log(), counting_bar(arguments.quiet) as progress:
+    with counting_bar(arguments.quiet) as progress:
         folder = render_sequence(config, arguments.out, progress)
-    print(folder if arguments.quiet else f"Sequence {folder}; next: bmask-slam run {folder}")
+    text = f"Sequence {folder}; next: bmask-slam run {folder}"
+    print_result(arguments, folder, lambda: text, {"sequence": folder})
     return 0
 
 
@@ -78,20 +81,20 @@ def add_info(commands: Commands) -> None:
     parser.set_defaults(handler=_info)
     parser.add_argument("sequence", type=Path, help="recording, or ROS bag")
     add_camera_argument(parser)
-    parser.add_argument("--json", action="store_true", help="print it as JSON; not of a bag")
+    parser.add_argument("--json", action="store_true", help="print it as JSON")
 
 
 def _info(arguments: argparse.Namespace) -> int:
-    from bmask_slam.runtime.progress import console_log
+    from bmask_slam.graph.files.json_file import format_json
     from bmask_slam.sequences import format_info, info_as_json, open_sequence, sequence_info
     from bmask_slam.sequences.bags.bag_file import format_topics, is_bag, open_bag
 
     if is_bag(arguments.sequence):
         with open_bag(arguments.sequence) as bag:
-            print(format_topics(bag))
+            topics = {"duration_s": bag.duration_s, "topics": list(bag.topics)}
+            print(format_json(topics) if arguments.json else format_topics(bag))
         return 0
-    with console_log():
-        info = sequence_info(open_sequence(arguments.sequence, camera=arguments.camera))
+    info = sequence_info(open_sequence(arguments.sequence, camera=arguments.camera))
     print(info_as_json(info) if arguments.json else format_info(info))
     return 0
 
@@ -106,20 +109,19 @@ def add_convert(commands: Commands) -> None:
     add_camera_argument(parser)
     add_topic_arguments(parser)
     parser.add_argument("--max-frames", type=int, metavar="N", help="only the first N images")
-    parser.add_argument("--quiet", action="store_true", help="print only the folder's path")
+    add_output_arguments(parser, "the folder's path")
 
 
 def _convert(arguments: argparse.Namespace) -> int:
-    from bmask_slam.runtime.progress import console_log, counting_bar
+    from bmask_slam.runtime.progress import counting_bar
     from bmask_slam.sequences.formats.convert import convert
 
     source = bag_topics(arguments).of_path(arguments.sequence)
-    with console_log(), counting_bar(arguments.quiet) as progress:
+    with counting_bar(arguments.quiet) as progress:
         done = convert(source, arguments.out, arguments.camera, arguments.max_frames, progress)
     folder = arguments.out
-    print(
-        folder if arguments.quiet else f"{done}\nSequence {folder}; next: bmask-slam run {folder}"
-    )
+    text = f"{done}\nSequence {folder}; next: bmask-slam run {folder}"
+    print_result(arguments, folder, lambda: text, {"sequence": folder, **vars(done)})
     return 0
 
 
@@ -135,24 +137,33 @@ def add_download(commands: Commands) -> None:
     parser.add_argument("--list", action="store_true", help="name all sequences, with sizes")
     parser.add_argument("--keep-archive", action="store_true", help="do not remove the archive")
     parser.add_argument("--catalogue", type=Path, metavar="F", help="another list of sequences")
-    parser.add_argument("--quiet", action="store_true", help="print only the folders' paths")
+    add_output_arguments(parser, "the folders' paths")
 
 
 def _download(arguments: argparse.Namespace) -> int:
     from bmask_slam.datasets.catalogue import find, format_catalogue, read_catalogue
     from bmask_slam.datasets.obtain import obtain
     from bmask_slam.graph.errors import InputError
-    from bmask_slam.runtime.progress import byte_bars, console_log
+    from bmask_slam.graph.files.json_file import format_json
+    from bmask_slam.runtime.progress import byte_bars
 
     catalogue = read_catalogue(arguments.catalogue)
     if arguments.list:
-        print(format_catalogue(catalogue))
+        known = list(catalogue.values())
+        names = "\n".join(catalogue)
+        told = {"recordings": known}
+        print_result(arguments, names, lambda: format_catalogue(catalogue), told)
         return 0
     if not arguments.names:
         raise InputError("download: no sequence is named; --list names all")
-    for recording in [find(catalogue, name) for name in arguments.names]:
-        with console_log(), byte_bars(arguments.quiet) as progress:
+    folders, found = [], [find(catalogue, name) for name in arguments.names]
+    for recording in found:
+        with byte_bars(arguments.quiet) as progress:
             folder = obtain(recording, arguments.to, progress, arguments.keep_archive)
         about = f"  ({recording.title}; {recording.licence}; {recording.page})"
-        print(folder if arguments.quiet else f"Sequence {folder}{about}")
+        folders.append(folder)
+        if not arguments.json:
+            print(folder if arguments.quiet else f"Sequence {folder}{about}")
+    if arguments.json:
+        print(format_json({"sequences": folders, "recordings": found}))
     return 0

@@ -15,16 +15,26 @@ from statistics import fmean, median
 import numpy as np
 
 from bmask_slam.comparison.experiment.experiment import VERDICT_METRICS
-from bmask_slam.comparison.experiment.metric_table import BY_NAME
-from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind, Method
+from bmask_slam.comparison.experiment.result import (
+    MIN_COVERAGE,
+    Cell,
+    CellStatus,
+    Comparison,
+    Kind,
+    Method,
+)
 from bmask_slam.graph.arrays import Array
+from bmask_slam.reporting.metric_table import BY_NAME
 
 LEVEL = 0.05
 RESAMPLES = 10_000
 FEWER_TRACKED = 0.01
 BETTER, WORSE, NO_DIFFERENCE = "better", "worse", "no difference shown"
+NOT_COMPARED = "not compared"
 TRACKED = "tracked_share"
+ERRORS = ("ate_", "rpe_", "drift_")
 TOO_FEW = "too few pairs for a verdict"
+FEW_PAIRS = f"Verdicts: {TOO_FEW}; more seeds or sequences give more pairs"
 
 
 @dataclass(frozen=True)
@@ -44,12 +54,12 @@ class Verdict:
     Attributes:
         metric, method, baseline: names.
         judgement: BETTER or WORSE than the baseline, if the interval excludes 0 and the sign test
-            agrees, else NO_DIFFERENCE.
+            agrees, else NO_DIFFERENCE; NOT_COMPARED if it covers too little of each sequence.
         difference: mean of method minus baseline over the pairs, in the unit of metrics.json;
             NaN without a pair.
         low, high: 95 % bootstrap interval of it.
         pairs: compared; wins: those in which the method is better; losses: worse.
-        incomplete: pairs in which one method has no value, as when its run failed.
+        incomplete: pairs in which one method has no value, as when its run failed or lost the way.
         p_value: of the exact two-sided sign test, after Holm's correction for all that is judged.
         note: a remark to print with it.
     """
@@ -88,8 +98,15 @@ def verdicts(comparison: Comparison, metrics: Sequence[str] | None = None) -> tu
     if not rows or rows[0].kind is not Kind.RUN:
         return ()
     others = [m for m in rows[1:] if m.with_scale == rows[0].with_scale]
-    found = (_verdict(comparison, rows[0], m, metric) for metric in metrics for m in others)
-    return _corrected([v for v in found if v.pairs])
+    found = [_verdict(comparison, rows[0], m, metric) for metric in metrics for m in others]
+    lost = (v for v in found if not v.pairs and v.note and v.metric.startswith(ERRORS))
+    judged = _corrected([v for v in found if v.pairs])
+    return (*judged, *(replace(v, judgement=NOT_COMPARED) for v in lost))
+
+
+def too_few(found: Sequence[Verdict]) -> bool:
+    """Whether there are verdicts, and each has too few pairs to be significant."""
+    return bool(found) and all(TOO_FEW in v.note or v.judgement == NOT_COMPARED for v in found)
 
 
 def pairs(
@@ -113,8 +130,13 @@ def pairs(
 
 
 def value_of(cell: Cell, metric: str) -> float:
-    """A cell's value; NaN where it has none or is not done."""
-    return cell.metrics.get(metric, nan) if cell.status is CellStatus.DONE else nan
+    """A cell's value to compare: NaN where it has none, is not done, or covers too little.
+
+    A trajectory with less than MIN_COVERAGE of the sequence may lack just its hard parts: no error
+    of it is compared.
+    """
+    lacks = metric.startswith(ERRORS) and cell.coverage < MIN_COVERAGE
+    return cell.metrics.get(metric, nan) if cell.status is CellStatus.DONE and not lacks else nan
 
 
 def bootstrap_interval(differences: Array, level: float = LEVEL) -> tuple[float, float]:

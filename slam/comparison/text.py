@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from bmask_slam.comparison.experiment.metric_table import BY_NAME
 from bmask_slam.comparison.experiment.result import CellStatus, Comparison
-from bmask_slam.comparison.report.table import TableRow, cell_name, metric_table
-from bmask_slam.comparison.statistics import TOO_FEW, Verdict, verdicts
+from bmask_slam.comparison.report.table import EMPTY, cell_name, metric_table
+from bmask_slam.comparison.statistics import FEW_PAIRS, Verdict, too_few, verdicts
+from bmask_slam.reporting.metric_table import BY_NAME
+from bmask_slam.reporting.parts import TableRow
 
 MAIN_METRIC = "ate_rmse"
 
@@ -19,8 +20,8 @@ def format_comparison(comparison: Comparison) -> str:
     """
     found = verdicts(comparison)
     judged = format_verdicts(found)
-    if found and all(TOO_FEW in verdict.note for verdict in found):
-        judged = f"Verdicts: {TOO_FEW}; more seeds or sequences give more pairs"
+    if too_few(found):
+        judged = FEW_PAIRS
     parts = [format_table(comparison, MAIN_METRIC), judged]
     return "\n\n".join(filter(None, [*parts, format_problems(comparison)]))
 
@@ -58,6 +59,8 @@ def _verdict(v: Verdict, first: bool) -> tuple[str, ...]:
     """The columns of a verdict; its metric is named in the first line of each."""
     metric = BY_NAME[v.metric]
     shown = [f"{metric.scale * x:+.{metric.digits + 1}f}" for x in (v.difference, v.low, v.high)]
+    if not v.pairs:
+        shown = [EMPTY] * 3
     notes = [f"{v.incomplete} pairs without figures"] * bool(v.incomplete) + [v.note] * bool(v.note)
     return (
         f"{metric.title} ({metric.unit})" if first else "",

@@ -169,7 +169,7 @@ class CachingSegmenter:
 
 
 def dense_follower(
-    world: WorldMap, semantics: SemanticMapper, sequence: Sequence, run: Path
+    world: WorldMap, semantics: SemanticMapper, sequence: Sequence, options: MapOptions
 ) -> Callable[[FrameResult], None]:
     """A function that fuses the keyframes of a run while it goes on, to be called every frame.
 
@@ -178,11 +178,12 @@ def dense_follower(
     when one cannot be written, as on a full disk.
 
     Raises:
-        InputError: the folder cannot be written.
+        InputError: the folder cannot be written, or the options cannot be used.
     """
     segmenter = semantics.segmenter = CachingSegmenter(semantics.segmenter)
-    mapped = MappedRun(run, world, [], sequence.camera, sequence=sequence)
-    fusion = RunFusion(mapped, segmenter, MapOptions(run, masks=semantics.config.segmenter))
+    mapped = MappedRun(options.run, world, [], sequence.camera, sequence=sequence)
+    options = replace(options, masks=semantics.config.segmenter)
+    fusion = RunFusion(mapped, segmenter, options)
 
     ended = False
 

@@ -32,7 +32,8 @@ class MapOptions:
         excluded: classes that are not mapped because they move; None: those whose prior
             probability to move is above one half.
         keep_excluded: write the points of excluded classes to a cloud of their own.
-        voxel_m: the cloud has at most one point in a cube with this edge.
+        voxel_m: the surface, and so the cloud, has at most one point in a cube with this edge.
+        mesh_voxel_m: the same in place of ``voxel_m``, for a preview; finished keyframes are kept.
         source: where depth comes from, see `mapping.inverse_depth.dense_mapper.DenseConfig`.
         device: torch's name of the device that computes the fusion.
         mesh, plan: whether to make them.
@@ -45,11 +46,17 @@ class MapOptions:
     excluded: tuple[str, ...] | None = None
     keep_excluded: bool = False
     voxel_m: float = 0.01
+    mesh_voxel_m: float | None = None
     source: DepthSource = "sensor"
     device: str = "cpu"
     mesh: bool = False
     plan: bool = False
     keep_volume: bool = False
+
+    @property
+    def surface_voxel_m(self) -> float:
+        """Edge of the surface's voxels."""
+        return self.voxel_m if self.mesh_voxel_m is None else self.mesh_voxel_m
 
 
 def resolve_options(options: MapOptions, labels: LabelSet) -> MapOptions:
@@ -59,8 +66,9 @@ def resolve_options(options: MapOptions, labels: LabelSet) -> MapOptions:
         InputError: the voxel size is out of range, or an excluded class is not in ``labels``.
     """
     low, high = VOXEL_RANGE_M
-    if not low <= options.voxel_m <= high:
-        raise InputError(f"voxel {options.voxel_m} m: must be between {low:g} and {high:g}")
+    for voxel_m in (options.voxel_m, options.surface_voxel_m):
+        if not low <= voxel_m <= high:
+            raise InputError(f"voxel {voxel_m} m: must be between {low:g} and {high:g}")
     excluded = options.excluded
     if excluded is None:
         movability = read_priors("movability").of(labels)

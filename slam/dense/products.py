@@ -38,6 +38,8 @@ from bmask_slam.semantics.beliefs.surface_geometry import FLOORS, Ground, find_g
 from bmask_slam.world.world_map import Keyframe
 
 PLAN_CELL_M, SAMPLE_STEP = 0.03, 20
+AMBIENT = 0.3
+"""Light from everywhere in the picture of the mesh; the rest comes from the camera."""
 AT_ONCE = 50_000
 NO_PIXELS = np.zeros((0, 0), np.uint16)
 OVERVIEW_OFFSET_M = np.array([0.0, -0.6, -1.0])
@@ -224,12 +226,14 @@ def _regions(fused: FusedMap) -> list[ObjectRegion]:
 
 
 def _write_mesh(fused: FusedMap, cloud: Cloud, triangles: Ints, up_guess: Array) -> list[Path]:
-    """Write the mesh, for viewers too, and a picture of its shape, lit from the camera."""
+    """Write the mesh, for viewers too, and a picture of it in its colours, lit from the camera."""
     up_world = up_direction(cloud.normals[::SAMPLE_STEP].astype(float), up_guess)
     path, T_world_camera = fused.folder.path, _middle(fused.keyframes())
-    seen = nearest_points(cloud.points, fused.run.camera, T_world_camera, fused.options.voxel_m)
+    point_m = 1.6 * fused.options.surface_voxel_m  # no gaps in what is seen aslant
+    seen = nearest_points(cloud.points, fused.run.camera, T_world_camera, point_m)
     lit = np.abs(cloud.normals @ T_world_camera[:3, 2].astype(np.float32))[:, None]
-    image = painted(seen, (lit * np.full(3, 255)).astype(np.uint8))
+    shaded = cloud.colours * (AMBIENT + (1 - AMBIENT) * lit)
+    image = painted(seen, shaded.astype(np.uint8))
     return [
         write_mesh(path / "mesh.ply", cloud, triangles),
         write_glb(path / "mesh.glb", cloud, triangles, up_world),
@@ -242,7 +246,7 @@ def _write_pictures(fused: FusedMap, cloud: Cloud, names: tuple[str, ...]) -> li
     folder, written = fused.folder.path, []
     present, colours = np.unique(cloud.labels).tolist(), palette(names)
     for name, (camera, T) in _viewpoints(fused.run.camera, fused.keyframes()).items():
-        seen = nearest_points(cloud.points, camera, T, fused.options.voxel_m)
+        seen = nearest_points(cloud.points, camera, T, fused.options.surface_voxel_m)
         image = painted(seen, cloud.colours)
         written.append(write_picture(folder / f"view_{name}.png", image))
         if len(present) > 1:

@@ -111,7 +111,7 @@ class _SurfaceMaker:
 
     def make(self, frames: dict[int, Array], progress: Progress) -> Surface:
         """The surface of all keyframes and of frames at T_world_camera (4, 4)."""
-        surface, voxel_m = self._surface, self._fused.options.voxel_m
+        surface, voxel_m = self._surface, self._fused.options.surface_voxel_m
         poses = {n: k.T_world_camera for n, k in self._keyframes.items()} | frames
         alone = FollowingSurface(self._volume(), self._load) if len(surface) else surface
         for number in self._keyframes:
@@ -149,13 +149,14 @@ class _SurfaceMaker:
     def _volume(self, folder: Path | None = None, kept: Ints | None = None) -> SurfaceVolume:
         folder = self._fused.folder.path if folder is None else folder
         options, camera = self._fused.options, self._fused.run.camera
-        return SurfaceVolume(options.voxel_m, camera, folder=folder, kept=kept)
+        return SurfaceVolume(options.surface_voxel_m, camera, folder=folder, kept=kept)
 
     def _made_of(self) -> dict[str, Any]:
         """What a kept volume must be of, beside the settings of the folder: all but poses."""
         ids = sorted(k.id for k in self._keyframes.values())
         return {
             "camera": repr(self._fused.run.camera),
+            "voxel_m": self._fused.options.surface_voxel_m,
             "keyframes": [[number, self._fused.folder.written_ns(number)] for number in ids],
         }
 
@@ -174,7 +175,7 @@ class _SurfaceMaker:
                 f"{folder.path}: the images of keyframe {number} are not of the camera's size; "
                 "remove the folder and map again"
             )
-        return depth_frame(depth, rgb, T_world_camera, camera, fused.options.voxel_m)
+        return depth_frame(depth, rgb, T_world_camera, camera, fused.options.surface_voxel_m)
 
     def _prepared(self, frames: dict[int, Array]) -> Iterator[tuple[int, DepthFrame | None]]:
         """The frames in order, some prepared ahead by a second thread."""
@@ -200,7 +201,7 @@ class _SurfaceMaker:
         measured = regularise(from_sensor(depth_m, run.camera, fusion_config(options).measurement))
         verdict = self._gate.judge(measured.depth_m(), T_world_camera)
         measured = measured.without(verdict.in_front)
-        frame = depth_frame(measured, rgb, T_world_camera, run.camera, options.voxel_m)
+        frame = depth_frame(measured, rgb, T_world_camera, run.camera, options.surface_voxel_m)
         mark_unexplained(frame, verdict.unexplained)
         return frame
 

@@ -37,6 +37,8 @@ logger = logging.getLogger(__name__)
 
 MIN_POSES = 3
 
+DRIFT_LENGTHS_M = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
+
 
 class Row(TypedDict):
     """One line of metrics.json; unit "1" is a share."""
@@ -101,6 +103,7 @@ def evaluate_trajectory(
     per_metre = relative_error(scaled, truth, path_pairs)
     rows = _absolute_rows(absolute) + _relative_rows("frame", per_frame)
     rows += _relative_rows("second", per_second) + _relative_rows("metre", per_metre)
+    rows += _drift_rows(scaled, truth)
     rows += _coverage_rows(estimate, reference, matched)
     if expected_frames:
         rows.append(_row("tracked_share", len(estimate) / expected_frames, "1"))
@@ -220,6 +223,24 @@ def _relative_rows(step: str, error: RelativeError | None) -> list[Row]:
         _row(f"rpe_trans_rmse_{step}", error.translation_m.rmse, "m"),
         _row(f"rpe_rot_rmse_{step}", degrees, "deg"),
     ]
+
+
+def _drift_rows(estimate: Trajectory, truth: Trajectory) -> list[Row]:
+    """The mean error over paths of DRIFT_LENGTHS_M, by the length; none for a shorter trajectory.
+
+    As in KITTI's odometry benchmark (Geiger et al. 2012), at a hundredth of its lengths.
+    """
+    translation, rotation = [], []
+    for length_m in DRIFT_LENGTHS_M:
+        pairs = distance_pairs(truth.positions_world, length_m)
+        if (error := relative_error(estimate, truth, pairs)) is not None:
+            translation.append(error.translation_m.errors / length_m)
+            rotation.append(np.rad2deg(error.rotation_rad.errors) / length_m)
+    if not translation:
+        return []
+    means = (float(np.concatenate(errors).mean()) for errors in (translation, rotation))
+    units = (("drift_trans", "1"), ("drift_rot", "deg/m"))
+    return [_row(name, mean, unit) for (name, unit), mean in zip(units, means, strict=True)]
 
 
 def _body_rows(T_camera_body: Array) -> list[Row]:

@@ -134,7 +134,9 @@ class BriskExtractor:
         pixels = pixels[self._spread(pixels, response, width)[:enough]]
         own = features.image_pixels[features.scales == 1]
         places, known = ((p @ [1, width]).astype(np.int64) for p in (pixels, own))
-        raw = pixels[~np.isin(places, known)].astype(float)
+        unknown = np.ones(gray.size, bool)
+        unknown[known] = False
+        raw = pixels[unknown[places]].astype(float)
         descriptors = np.zeros((len(raw), features.descriptors.shape[1]), np.uint64)
         return self._assemble(
             frame, gray, (raw, np.ones(len(raw)), np.zeros(len(raw))), descriptors

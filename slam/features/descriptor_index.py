@@ -7,6 +7,7 @@ descriptor of the query votes for the keyframes that hold a near one.
 from __future__ import annotations
 
 from collections.abc import Collection
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 
 import faiss
@@ -14,6 +15,8 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Bits, Bytes, Ints, Mask
 
+_Found = tuple[Ints, Ints, Ints]
+"""What faiss found: where each query's rows begin and end, their distances, the rows."""
 BITS = 512
 ROWS_PER_LIST = 32  # before the index is partitioned
 
@@ -60,6 +63,8 @@ class DescriptorIndex:
     def __init__(self, config: IndexConfig | None = None):
         self.config = config or IndexConfig()
         self._descriptors: dict[int, Bits] = {}
+        self._ahead: tuple[Bytes, Future[_Found]] | None = None
+        self._searcher = ThreadPoolExecutor(1, "place-search")
         self._clear()
 
     def __len__(self) -> int:
@@ -98,6 +103,16 @@ class DescriptorIndex:
         if 2 * self._removed > self._rows:
             self.rebuild()
 
+    def search_ahead(self, descriptors: Bits) -> None:
+        """Begin the search for descriptors (N, 8) in a thread; ``votes`` of the same will wait.
+
+        The results are the same: a change of the index ends what was begun.
+        """
+        self._forget_search()
+        query = self._query(descriptors)
+        if self._rows and len(query):
+            self._ahead = query, self._searcher.submit(self._search, query)
+
     def votes(self, descriptors: Bits, excluded: Collection[int] = ()) -> Votes:
         """Votes of descriptors (N, 8) for the keyframes in the index, without the excluded ones."""
         excluded = set(excluded)
@@ -123,20 +138,37 @@ class DescriptorIndex:
 
     def _near(self, descriptors: Bits) -> tuple[Ints, Ints, Ints]:
         """(query row, keyframe id, Hamming distance) within the gate, also of removed keyframes."""
-        step = max(-(-len(descriptors) // self.config.query_keypoints), 1)
-        query = _bytes(descriptors[::step])
+        query = self._query(descriptors)
         if self._rows == 0 or len(query) == 0:
             return (np.zeros(0, np.int64),) * 3
-        # faiss returns distances strictly below the radius
-        limits, distance, rows = self._index.range_search(query, self.config.max_distance + 1)
-        limits = limits.astype(np.int64)
+        if self._ahead is not None and np.array_equal(self._ahead[0], query):
+            limits, distance, rows = self._ahead[1].result()
+        else:
+            limits, distance, rows = self._search(query)
         owner = np.repeat(np.arange(len(query)), limits[1:] - limits[:-1])
         starts = np.array(self._starts)
         owners = np.array(self._owners)
         keyframe_ids = owners[np.searchsorted(starts, rows, side="right") - 1]
-        return owner, keyframe_ids, distance.astype(np.int64)
+        return owner, keyframe_ids, distance
+
+    def _query(self, descriptors: Bits) -> Bytes:
+        """Those of the descriptors (N, 8) that vote, (M, 64)."""
+        step = max(-(-len(descriptors) // self.config.query_keypoints), 1)
+        return _bytes(descriptors[::step])
+
+    def _search(self, query: Bytes) -> _Found:
+        # faiss returns distances strictly below the radius
+        limits, distance, rows = self._index.range_search(query, self.config.max_distance + 1)
+        return limits.astype(np.int64), distance.astype(np.int64), rows
+
+    def _forget_search(self) -> None:
+        """Before the index changes: wait for the search that runs ahead, whose rows get invalid."""
+        if self._ahead is not None:
+            wait([self._ahead[1]])
+        self._ahead = None
 
     def _append(self, keyframe_id: int, descriptors: Bits) -> None:
+        self._forget_search()
         if len(descriptors) == 0:
             return
         self._starts.append(self._rows)
@@ -145,6 +177,7 @@ class DescriptorIndex:
         self._rows += len(descriptors)
 
     def _clear(self) -> None:
+        self._forget_search()
         self._index: faiss.IndexBinary = faiss.IndexBinaryFlat(BITS)
         self._partitioned = False
         self._rows = self._removed = 0

@@ -142,6 +142,11 @@ def _sample(gray: Image, pixels: Array, radius: int) -> Floats:
     a, b = (corner - whole).astype(np.float32).T
     steps = np.arange(side)
     offsets = (steps[:, None] * gray.shape[1] + steps)[:, :, None]
-    window = gray.ravel()[offsets + (row * gray.shape[1] + column)].astype(np.float32)
-    rows = window[:, :-1] + a * (window[:, 1:] - window[:, :-1])
-    return rows[:-1] + b * (rows[1:] - rows[:-1])
+    window = gray.ravel().take(offsets + (row * gray.shape[1] + column)).astype(np.float32)
+    rows = window[:, 1:] - window[:, :-1]
+    rows *= a
+    rows += window[:, :-1]
+    between = rows[1:] - rows[:-1]
+    between *= b
+    between += rows[:-1]
+    return between

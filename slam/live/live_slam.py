@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import logging
-import math
 import tempfile
 import time
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation import Row
 from bmask_slam.graph.arrays import Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.sensors.streams import Measurements
-from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.labelling.results import LandmarkCloud
 from bmask_slam.live.display import Display
 from bmask_slam.live.health import FrameMeter, Health, measure_health
+from bmask_slam.live.live_map import LiveMap
 from bmask_slam.live.recorder import Recorder, rescued
 from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.live.sources.source_clock import SourceClock
@@ -29,7 +26,6 @@ from bmask_slam.live.system import Prepared
 from bmask_slam.run_folder import metrics
 from bmask_slam.run_folder.folder import HEALTH, RunFolder
 from bmask_slam.run_folder.metrics import RunCounters, row
-from bmask_slam.sensor_input import SensorInput
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
@@ -41,13 +37,11 @@ if TYPE_CHECKING:  # it loads torch
 __all__ = ["LiveOptions", "LiveSlam", "Prepared"]
 logger = logging.getLogger(__name__)
 
-MAX_MAP_WAIT_S = 1.0
-"""Longest time that one call of ``catch_up`` waits for the map."""
 DENSE_FINISH_S = 600.0
 """Longest time that the dense map may take to finish at the end."""
 
 
-class LiveSlam(SensorInput):
+class LiveSlam(LiveMap):
     """Tracks frames as they come; map, segmentation and dense map run in processes of their own.
 
     A context manager: leaving it ends the processes and saves everything, also after an error.
@@ -157,18 +151,6 @@ class LiveSlam(SensorInput):
         self._show(result, rgb)
         return result
 
-    def add_measurements(self, new: Measurements) -> None:
-        """Use the measurements of a sensor with the next frame; from any thread."""
-        self._system.add_measurements(new)
-
-    def add_factor(self, factor: Any) -> int:
-        """See `SensorInput.add_factor`; from the thread that tracks. A refusal is an event."""
-        return self._system.add_factor(factor)
-
-    def remove_factor(self, number: int) -> None:
-        """See `SensorInput.remove_factor`."""
-        self._system.remove_factor(number)
-
     def _process(self, frame: Frame, prepared: Prepared | None) -> FrameResult:
         """Do a frame's step; one that is refused is counted."""
         try:
@@ -201,37 +183,9 @@ class LiveSlam(SensorInput):
             self._recorder.camera(self.camera, self.calibration)
 
     @property
-    def calibration(self) -> str:
-        """What was found of the camera, in one line; "" if nothing, or if it was not tried."""
-        found = self._system.calibration
-        return "" if found is None else found.text
-
-    @property
     def out(self) -> Path | None:
         """The run folder: another one than asked for if that was renamed or removed meanwhile."""
         return self._recorder.folder.last_path if self._recorder else None
-
-    def trajectory(self) -> Trajectory:
-        """Every frame of the largest map segment so far, from the keyframes' present poses."""
-        return self._system.trajectory()
-
-    def map(self) -> LandmarkCloud:
-        """The landmarks of the largest map segment at present."""
-        return self._system.landmarks()
-
-    def catch_up(self, waiting: float = math.inf) -> None:
-        """Apply the other processes' results; wait until at most ``waiting`` keyframes are pending.
-
-        The wait ends after ``MAX_MAP_WAIT_S`` in any case.
-        """
-        self._system.wait_for_map(waiting, MAX_MAP_WAIT_S)
-
-    def processes(self) -> dict[str, int]:
-        """Process ids by name."""
-        system = self._system
-        owners = {"map": system.remote, "segmenter": system.segmenter, "dense": system.dense}
-        last = {} if system.calibration is None else {"calibration": system.calibration.pid}
-        return {name: part.worker.pid for name, part in owners.items() if part is not None} | last
 
     def health(self) -> Health:
         """The state of the live loop."""

@@ -11,6 +11,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import FileKind
 from bmask_slam.graph.inertial.tables import InertialState
 from bmask_slam.graph.sensors.streams import Measurements
+from bmask_slam.labelling.results import MapObjects
 from bmask_slam.live.replica import WorldDelta
 from bmask_slam.semantics.instances.instances import Instance, PackedMask
 from bmask_slam.tracking.results import Tracked
@@ -173,6 +174,18 @@ class SaveState:
     path: Path
 
 
+@dataclass(frozen=True)
+class TellObjects:
+    """To the map: send its objects."""
+
+
+@dataclass(frozen=True)
+class SaveMap:
+    """To the map: write the file that other runs go on from, or are localised in."""
+
+    path: Path
+
+
 @dataclass(frozen=True, eq=False)
 class Finish:
     """To the map: no more keyframes; optimise a last time and write the state to a file."""
@@ -203,6 +216,21 @@ class StateSaved:
 
     number: int
     path: Path
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectsTold:
+    """From the map: the objects of its largest segment."""
+
+    objects: MapObjects
+
+
+@dataclass(frozen=True)
+class MapSaved:
+    """From the map: ``path`` is written; ``failure`` says why it is not."""
+
+    path: Path
+    failure: str = ""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """A copy of the map in another process, kept up to date by differences.
 
 The map's owner runs in its own process, and tracking needs the whole map for every frame. So the
-owner sends a ``WorldDelta`` after each change: every pose and point, since optimisation moves all
-of them, but descriptors, patches and observations only where they changed.
+owner sends a ``WorldDelta`` after each change: every keyframe's pose, and of points, descriptors,
+patches and observations those that changed.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from hashlib import blake2b
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +25,6 @@ COLUMNS = (
     *("colours", "host", "last_keyframe", "observations"),
 )
 """Columns of the landmark table that are sent; tracking counts ``visible`` and ``found``."""
-COMPARED = ("descriptors", "directions", "patch_views", "host", "observations")
-"""Columns that are compared: the others change only together with one of these."""
 _ODD, _HALF = np.uint64(0x9E3779B97F4A7C15), np.uint64(32)
 
 
@@ -49,7 +46,8 @@ class WorldDelta:
     Attributes:
         size: number of landmarks ever made.
         in_map: (size,) flags as packed bits.
-        points_world: (A, 3) of the valid landmarks, in the order of their ids.
+        moved: (A,) valid landmarks that are new or have another position.
+        points_world: (A, 3) of these.
         ids: (R,) valid landmarks of which another column changed.
         columns: the rows of these, by the name of the column.
         replaced_by: (size,) of all landmarks if any was fused, else None.
@@ -63,6 +61,7 @@ class WorldDelta:
 
     size: int
     in_map: Bytes
+    moved: Ints
     points_world: Array
     ids: Ints
     columns: Arrays
@@ -77,12 +76,15 @@ class WorldDelta:
 
 @dataclass
 class _Sent:
-    """What the copy has, as digests; landmarks are the valid ones, whose ids are ``ids``."""
+    """What the copy has of landmarks (N,) and keyframes; points are digests."""
 
-    ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    landmarks: Bits = field(default_factory=lambda: np.zeros(0, np.uint64))
+    in_map: Mask = field(default_factory=lambda: np.zeros(0, bool))
+    points: Bits = field(default_factory=lambda: np.zeros(0, np.uint64))
+    host: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
+    observations: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
+    appearance: int = 0  # revision
     fused: int = 0
-    observations: dict[int, bytes] = field(default_factory=dict)
+    keyframes: dict[int, int] = field(default_factory=dict)  # revisions
     parents: set[int] = field(default_factory=set)
 
 
@@ -100,16 +102,17 @@ class DeltaMaker:
     def delta(self, world: WorldMap, history: FrameHistory) -> WorldDelta:
         """What changed since the last call; the whole map at the first."""
         table, keyframes = world.landmarks, list(world.keyframes.values())
-        ids = self._changed_landmarks(world)
+        moved, ids = self._changed_landmarks(world)
         fused = int(np.count_nonzero(table.replaced_by >= 0))
         replaced_by = table.replaced_by.copy() if fused != self._sent.fused else None
         self._sent.fused = fused
-        for culled in self._sent.observations.keys() - world.keyframes.keys():
-            del self._sent.observations[culled]
+        for culled in self._sent.keyframes.keys() - world.keyframes.keys():
+            del self._sent.keyframes[culled]
         return WorldDelta(
             size=len(table),
             in_map=np.packbits(table.in_map),
-            points_world=table.points_world[table.in_map],
+            moved=moved,
+            points_world=table.points_world[moved],
             ids=ids,
             columns={name: getattr(table, name)[ids] for name in COLUMNS},
             replaced_by=replaced_by,
@@ -121,22 +124,30 @@ class DeltaMaker:
             parents=self._new_parents(history),
         )
 
-    def _changed_landmarks(self, world: WorldMap) -> Ints:
-        """Valid landmarks whose compared columns differ from what was sent before."""
+    def _changed_landmarks(self, world: WorldMap) -> tuple[Ints, Ints]:
+        """Valid landmarks that moved, and those of which another column changed."""
         table, sent = world.landmarks, self._sent
-        ids = np.flatnonzero(table.in_map)
-        digests = digest_rows([getattr(table, name)[ids] for name in COMPARED])
-        _, now, sent_rows = np.intersect1d(ids, sent.ids, assume_unique=True, return_indices=True)
-        same = digests[now] == sent.landmarks[sent_rows]
-        sent.ids, sent.landmarks = ids, digests
-        return np.delete(ids, now[same])
+        fresh = table.in_map.copy()
+        fresh[: len(sent.in_map)] &= ~sent.in_map[: len(fresh)]
+        moved, changed = fresh.copy(), fresh
+        valid = np.flatnonzero(table.in_map)
+        points = np.zeros(len(table), np.uint64)
+        points[valid] = digest_rows([table.points_world[valid]])
+        written, sent.appearance = table.written_since(sent.appearance)
+        known = np.flatnonzero(table.in_map & ~fresh)
+        moved[known] = points[known] != sent.points[known]
+        changed[known] = written[known] | (table.host[known] != sent.host[known])
+        changed[known] |= table.observations[known] != sent.observations[known]
+        sent.in_map, sent.points = table.in_map.copy(), points
+        sent.host, sent.observations = table.host.copy(), table.observations.copy()
+        return np.flatnonzero(moved), np.flatnonzero(changed)
 
     def _has_changed(self, keyframe: Keyframe) -> bool:
-        return self._sent.observations.get(keyframe.id) != _digest(keyframe)
+        return self._sent.keyframes.get(keyframe.id) != keyframe.revision
 
     def _row(self, keyframe: Keyframe) -> KeyframeRow:
         ids, masked = keyframe.landmark_ids.copy(), keyframe.masked.copy()
-        self._sent.observations[keyframe.id] = _digest(keyframe)
+        self._sent.keyframes[keyframe.id] = keyframe.revision
         features = None if keyframe.id in self._features else keyframe.features
         self._features.add(keyframe.id)
         return KeyframeRow(ids, masked, keyframe.frame_index, keyframe.timestamp_s, features)
@@ -159,13 +170,6 @@ def digest_rows(columns: Sequence[NDArray]) -> Bits:
             digests = (digests ^ words) * _ODD
             digests ^= digests >> _HALF
     return digests
-
-
-def _digest(keyframe: Keyframe) -> bytes:
-    """16 bytes for what a keyframe observes."""
-    found = blake2b(keyframe.landmark_ids.tobytes(), digest_size=16)
-    found.update(keyframe.masked.tobytes())
-    return found.digest()
 
 
 def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> None:
@@ -203,7 +207,7 @@ def _apply_landmarks(delta: WorldDelta, world: WorldMap) -> None:
     in_map = np.zeros(len(table), bool)
     in_map[: delta.size] = np.unpackbits(delta.in_map, count=delta.size)
     table.set_in_map(in_map)
-    table.points_world[table.in_map] = delta.points_world
+    table.points_world[delta.moved] = delta.points_world
     for name, rows in delta.columns.items():
         getattr(table, name)[delta.ids] = rows
     if delta.replaced_by is not None:

@@ -43,6 +43,8 @@ class LiveOptions:
             ``bmask-slam map`` reads it.
         title: of the plot of the trajectory.
         dense: make a dense map as well; needs ``out``.
+        mesh_voxel_m: edge of its voxels, for a preview; None: 0.01.
+        submap_points: number of points of each submap that `LiveSlam.on_submap` gives.
         calibrate: whether readout time, depth delay and bend of depth are found while it runs:
             ``auto`` uses what is found, ``report`` only says so, ``off``.
         straightens: whether the source straightens depth by `LiveSlam.camera`, also one that is
@@ -58,6 +60,8 @@ class LiveOptions:
     images: Path | None = None
     title: str = "live"
     dense: bool = False
+    mesh_voxel_m: float | None = None
+    submap_points: int = 0
     calibrate: str = "off"
     straightens: bool = False
     interpolates: bool = False
@@ -92,8 +96,8 @@ def start_dense(
     """The process that makes the dense map in a run folder."""
     from bmask_slam.live.processes import remote_dense  # noqa: PLC0415 - loads torch
 
-    points = PREVIEW_POINTS if options.view.enabled else 0
-    setup = remote_dense.DenseSetup(out, camera, masks, labels.names, points)
+    points = max(PREVIEW_POINTS if options.view.enabled else 0, options.submap_points)
+    setup = remote_dense.DenseSetup(out, camera, masks, labels.names, points, options.mesh_voxel_m)
     return remote_dense.RemoteDenseMapper(setup)
 
 

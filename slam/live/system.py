@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import gc
-import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import faiss
 import numpy as np
 
 from bmask_slam.features.brisk import Features
@@ -35,6 +32,7 @@ from bmask_slam.live.processes.remote_calibration import RemoteCalibration
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
+from bmask_slam.runtime.memory import short_pauses
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
@@ -48,33 +46,13 @@ if TYPE_CHECKING:  # it loads torch
 
 FIRST_MAP_S = 5.0
 """Longest wait of the first frame of a map for its landmarks."""
-SWITCH_S = 0.0005
-"""Longest time that another thread keeps Python's lock, which tracking needs often in a frame."""
 MASKS_S = 10.0
 """Longest wait for the masks of the last keyframes at the end."""
 CALIBRATION_S = 15.0
 """Longest wait for an estimate of the camera that is under way at the end."""
 FINISH_S = 600.0
-
-
-@contextmanager
-def settings_for_tracking() -> Iterator[None]:
-    """Set the interpreter and faiss for short pauses of this process; restore them at the end.
-
-    A setting that already is as wanted, for instance by another live system, is left alone.
-    """
-    switch_s, threads = sys.getswitchinterval(), faiss.omp_get_max_threads()
-    with ExitStack() as restore:
-        if switch_s > SWITCH_S:
-            sys.setswitchinterval(SWITCH_S)
-            restore.callback(sys.setswitchinterval, switch_s)
-        if threads > 1:  # a second thread would wait for a core, and tracking for that thread
-            faiss.omp_set_num_threads(1)
-            restore.callback(faiss.omp_set_num_threads, threads)
-        if not gc.get_freeze_count():  # scanning all modules would stop tracking for 0.1 s
-            gc.freeze()
-            restore.callback(gc.unfreeze)
-        yield
+REFRESH_FRAMES = 5
+"""Where no keyframes are made, the local map is chosen anew after so many frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +92,7 @@ class LiveSystem(SlamSystem):
         self.segmenter, self.dense, self.calibration = segmenter, dense, calibration
         self._measured: deque[Measurements] = deque()
         self._own_factors = -1
+        self._located = 0
         self._names = (segmenter or NoSegmenter).labels.names
         with ExitStack() as undo:
             self.remote = RemoteMapper(camera, config, self._names, folder)
@@ -123,7 +102,7 @@ class LiveSystem(SlamSystem):
             if dense is not None:
                 dense.wait_until_ready()
             self.semantics = _RemoteSemantics(self)
-            undo.enter_context(settings_for_tracking())
+            undo.enter_context(short_pauses())
             self._resources = undo.pop_all()
 
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
@@ -244,6 +223,18 @@ class LiveSystem(SlamSystem):
         self.remote.reference = self.camera_tracker.reference
         segment = self.camera_tracker.segment
         return tracked, self.remote.insert(frame, tracked, segment, local_ids)
+
+    def _record_pose(
+        self, frame: Frame, tracked: Tracked, keyframe: Keyframe | None
+    ) -> Array | None:
+        """As offline; where no keyframes are made, the local map follows the landmarks in view."""
+        T_world_camera = super()._record_pose(frame, tracked, keyframe)
+        if not self.remote.extends and T_world_camera is not None:
+            self._located += 1
+            near = self.remote.world.covisible(tracked.landmark_ids, 1)
+            if near and self._located % REFRESH_FRAMES == 0:
+                self.camera_tracker.refer_to(near[0][1])
+        return T_world_camera
 
     def finish(self) -> None:
         """Let the other processes finish; afterwards this is an offline system with the map."""

@@ -117,8 +117,11 @@ class LoopCloser:
         return {end for pair in self.closed for end in pair}
 
     def add(self, keyframe: Keyframe) -> None:
-        """Add a keyframe to the index."""
-        self.index.add(keyframe.id, keyframe.features.descriptors)
+        """Add a keyframe to the index, and begin to search its place there."""
+        descriptors = keyframe.features.descriptors
+        self.index.add(keyframe.id, descriptors)
+        if self.config.enabled:
+            self.index.search_ahead(descriptors)
 
     def remove(self, keyframe_id: int) -> None:
         """Remove a keyframe that left the map, with the waiting loops that end in it."""

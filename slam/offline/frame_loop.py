@@ -7,9 +7,9 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from bmask_slam.calibration.camera_check import CameraCheck, check_camera
 from bmask_slam.evaluation import Row
@@ -25,10 +25,12 @@ from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.runtime.progress import Progress
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.sequences import Sequence, format_camera
-from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_interface import System
 from bmask_slam.tracking.results import FrameResult
+
+if TYPE_CHECKING:
+    from bmask_slam.dense.options import MapOptions
 
 logger = logging.getLogger(__name__)
 
@@ -131,9 +133,7 @@ def _begin(run: ActiveRun, checkpoints: Checkpoints) -> None:
 def process_frames(run: ActiveRun) -> bool:
     """Process the remaining frames; whether the run is to begin anew, with the camera found."""
     system, counters, remaining = run.system, run.counters, run.remaining
-    frames = run.sequence.frames(
-        remaining.start, remaining.stop, remaining.step, prepare=_timed(system.prepare)
-    )
+    frames = run.sequence.frames(remaining.start, remaining.stop, remaining.step)
     checkpoints = Checkpoints(run.folder, run.options, run.sequence, run.calibrator, run.unwritten)
     if not counters.frames:
         _begin(run, checkpoints)
@@ -144,9 +144,8 @@ def process_frames(run: ActiveRun) -> bool:
         Progress(len(run.indices), run.options.quiet, done) as bar,
         _snapshots(run) as snapshot,
     ):
-        for frame, (features, ms) in frames:
-            result = system.process(frame, features)
-            result = replace(result, stage_ms={**result.stage_ms, "features": ms})
+        for frame in frames:
+            result = system.process(frame)
             run.folder.write_frame(result)
             counters.count(result)
             if fuse is not None:
@@ -192,9 +191,8 @@ def finish_run(run: ActiveRun) -> RunSummary:
     save(run.system, run.folder, rows, run.reference, title)
     if options.dense:
         from bmask_slam.dense.map_run import map_run  # noqa: PLC0415 - loads torch
-        from bmask_slam.dense.options import MapOptions  # noqa: PLC0415
 
-        map_run(MapOptions(run.folder.path))
+        map_run(_map_options(run))
     if stopped_by is None:
         run.folder.complete()
     skipped = sum(index < counters.next_index for index, _ in run.sequence.skipped)
@@ -244,8 +242,14 @@ def _dense_follower(run: ActiveRun) -> Callable[[FrameResult], None]:
     if not isinstance(run.system, SlamSystem):
         return lambda result: None
     return dense_follower(
-        run.system.mapper.world, run.system.semantics, run.sequence, run.folder.path
+        run.system.mapper.world, run.system.semantics, run.sequence, _map_options(run)
     )
+
+
+def _map_options(run: ActiveRun) -> MapOptions:
+    from bmask_slam.dense.options import MapOptions  # noqa: PLC0415 - loads torch
+
+    return MapOptions(run.folder.path, mesh_voxel_m=run.options.mesh_voxel_m)
 
 
 @contextmanager
@@ -276,14 +280,3 @@ def _snapshots(run: ActiveRun) -> Iterator[Callable[[], None]]:
     finally:
         if counters.frames:
             run.folder.write_trajectory(run.system.trajectory())
-
-
-def _timed(prepare: Callable[[Frame], Any]) -> Callable[[Frame], tuple[Any, float]]:
-    """The function with the milliseconds it took."""
-
-    def timed(frame: Frame) -> tuple[Any, float]:
-        start_s = time.perf_counter()
-        features = prepare(frame)
-        return features, 1e3 * (time.perf_counter() - start_s)
-
-    return timed

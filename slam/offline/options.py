@@ -15,9 +15,11 @@ from bmask_slam.system_config import SystemConfig
 _PATHS = ("sequence", "camera", "reference", "map")
 _RECORDED = (
     *(*_PATHS, "config_name", "max_frames", "stride", "checkpoint_every", "dense"),
-    "calibrate",
+    *("calibrate", "mesh_voxel_m"),
 )
-_FLAGS = {"map": "--continue", "dense": "--map"}
+_ADDED = {"mesh_voxel_m": None}
+"""What checkpoints written before do not have."""
+_FLAGS = {"map": "--continue", "dense": "--map", "mesh_voxel_m": "--mesh-voxel"}
 """Flags that differ from the name of their field."""
 
 
@@ -42,6 +44,7 @@ class RunOptions:
         calibrate: whether the camera's readout time and delay are found from its motion:
             "auto", and used where that is sure; "report", and only said; "off".
         dense: also make a dense map, fusing keyframes while the run goes on.
+        mesh_voxel_m: edge of its voxels, for a preview; None: 0.01.
         quiet: no progress bar.
     """
 
@@ -59,6 +62,7 @@ class RunOptions:
     localise: Path | None = None
     calibrate: str = "auto"
     dense: bool = False
+    mesh_voxel_m: float | None = None
     quiet: bool = False
 
     def __post_init__(self) -> None:
@@ -87,7 +91,7 @@ class RunOptions:
         cls, recorded: Mapping[str, Any], config: SystemConfig, out: Path
     ) -> RunOptions:
         """The options of ``recorded`` values. Raises KeyError or TypeError for others."""
-        found = {name: recorded[name] for name in _RECORDED}
+        found = {name: (_ADDED | dict(recorded))[name] for name in _RECORDED}
         paths = {name: Path(found[name]) for name in _PATHS if found[name]}
         return cls(**{**found, **paths}, config=config, out=out.absolute())
 

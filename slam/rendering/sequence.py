@@ -15,7 +15,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.rendering.annotations import (
     OBJECTS_TRUTH,
@@ -155,7 +155,8 @@ class _Job:
 
 def _check(config: RenderConfig) -> None:
     if config.name not in SCENES:
-        raise InputError(f"scene {config.name!r} is unknown; choose one of {', '.join(SCENES)}")
+        known = f"{', '.join(SCENES)}{did_you_mean(config.name, SCENES)}"
+        raise InputError(f"scene {config.name!r} is unknown; choose one of {known}")
     if config.frames is not None and config.frames < 1:
         raise InputError(f"frames={config.frames}: must be at least 1")
     if config.rounds < 1:

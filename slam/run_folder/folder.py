@@ -23,6 +23,7 @@ camera.yaml           the camera of the run, where readout time or delay were fo
                       or what ``bmask-slam calibrate`` found
 recordings.json       of a merged run: its recordings, and what was added to their stamps
 trajectory_run_N.txt  of a merged run: the frames of the Nth run, with its own stamps
+report.html, film.gif after ``bmask-slam report`` and ``film``: a web page, a short film
 health.json           of a live run: rates, delays, queues, what was dropped, every second
 checkpoint            while a run with ``--checkpoint-every`` is not finished: the state from
                       which ``run --resume`` goes on; removed when the run is complete
@@ -69,13 +70,12 @@ FILES = (
     "trajectory.png",
     LOG,
 )
-CAMERA = "camera.yaml"
-CHECKPOINT = "checkpoint"
+CAMERA, CHECKPOINT = "camera.yaml", "checkpoint"
 SEQUENCE_FILES = ("rgb.txt", "depth.txt", "associations.txt")
 """What is only in a folder that nothing may be removed from."""
-DENSE = "dense"
-HEALTH = "health.json"
-SOMETIMES = (CHECKPOINT, CAMERA, COVARIANCES, HEALTH, JOINED, *SEMANTIC_FILES)
+DENSE, HEALTH = "dense", "health.json"
+REPORT, FILM = "report.html", "film.gif"
+SOMETIMES = (CHECKPOINT, CAMERA, COVARIANCES, HEALTH, JOINED, REPORT, FILM, *SEMANTIC_FILES)
 OF_MERGED_RUNS = "trajectory_run_*.txt"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("bmask_slam",)

@@ -1,14 +1,19 @@
-"""Memory of this process."""
+"""Memory of this process, and settings by which it pauses less."""
 
 from __future__ import annotations
 
 import ctypes
+import gc
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't start new thread")
 """What the dynamic linker and Python say where there is no memory for a library or a thread."""
+SWITCH_S = 0.0005
+"""Longest time that another thread keeps Python's lock, which tracking needs often in a frame."""
 
 
 def is_out_of_memory(error: BaseException) -> bool:
@@ -47,3 +52,25 @@ def give_back_memory() -> None:
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
     if trim is not None:
         trim(0)
+
+
+@contextmanager
+def short_pauses() -> Iterator[None]:
+    """Set the interpreter and faiss for short pauses of this process; restore them at the end.
+
+    A setting that already is as wanted, for instance by another live system, is left alone.
+    """
+    import faiss  # noqa: PLC0415 - loads slowly
+
+    switch_s, threads = sys.getswitchinterval(), faiss.omp_get_max_threads()
+    with ExitStack() as restore:
+        if switch_s > SWITCH_S:
+            sys.setswitchinterval(SWITCH_S)
+            restore.callback(sys.setswitchinterval, switch_s)
+        if threads > 1:  # a second thread would wait for a core, and tracking for that thread
+            faiss.omp_set_num_threads(1)
+            restore.callback(faiss.omp_set_num_threads, threads)
+        if not gc.get_freeze_count():  # scanning all modules would stop tracking for 0.1 s
+            gc.freeze()
+            restore.callback(gc.unfreeze)
+        yield

@@ -105,12 +105,16 @@ class _BarHandler(logging.Handler):
 
 @contextmanager
 def console_log(level: int = logging.WARNING) -> Iterator[None]:
-    """Show log records from ``level`` on stderr, above the bar."""
+    """Show log records from ``level`` on stderr, above the bar; INFO only those of this package."""
     handler = _BarHandler(level)
     handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
-    root = logging.getLogger()
+    root, own = logging.getLogger(), logging.getLogger("bmask_slam")
     root.addHandler(handler)
+    before = own.level
+    if level < logging.WARNING:
+        own.setLevel(level)
     try:
         yield
     finally:
+        own.setLevel(before)
         root.removeHandler(handler)

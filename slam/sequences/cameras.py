@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.graph.camera import MAX_SIDE_PX, NO_DEPTH_DISTORTION, Camera, DepthNoise
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.files.yaml_file import format_yaml, read_yaml
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.sequences.camera_presets import (
@@ -171,8 +171,9 @@ def _read(path: Path) -> tuple[Camera, set[str]]:
 def _values(path: Path) -> dict[str, object]:
     """The values of a camera.yaml by key, none unknown and none missing. Raises InputError."""
     if not path.is_file():
+        near = did_you_mean(str(path), PRESETS)
         raise InputError(
-            f"{path}: no such file; give a camera.yaml, or one of {', '.join(PRESETS)}"
+            f"{path}: no such file; give a camera.yaml, or one of {', '.join(PRESETS)}{near}"
         )
     try:
         values = read_yaml(path)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar, overload
 
 import numpy as np
 
@@ -23,8 +22,6 @@ from bmask_slam.sequences.prefetch import prefetched
 from bmask_slam.sequences.recording import Recording
 
 logger = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -124,35 +121,14 @@ class Sequence:
         share = float(self.pairs.neighbour_shares[index])
         return depth_between(depth_m, other_m, share), -offset_s
 
-    @overload
     def frames(
         self, start: int = 0, stop: int | None = None, stride: int = 1, prefetch: int = 4
-    ) -> Generator[Frame, None, None]: ...
-
-    @overload
-    def frames(
-        self,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        prefetch: int = 4,
-        *,
-        prepare: Callable[[Frame], T],
-    ) -> Generator[tuple[Frame, T], None, None]: ...
-
-    def frames(
-        self,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        prefetch: int = 4,
-        *,
-        prepare: Callable[[Frame], Any] | None = None,
-    ) -> Generator[Any, None, None]:
+    ) -> Generator[Frame, None, None]:
         """Decode the frames ``start:stop:stride`` in a thread, up to ``prefetch`` ahead.
 
-        With ``prepare`` that function is applied in the same thread, and pairs (frame, result)
-        are yielded. Broken frames are skipped with a warning and listed in ``skipped``.
+        Nothing else is done in that thread: it would wait for the interpreter lock again and again,
+        and whoever has it for the thread. Broken frames are skipped with a warning and listed in
+        ``skipped``.
 
         Raises:
             InputError: more than ``max_broken_share`` of the sequence is broken.
@@ -160,10 +136,7 @@ class Sequence:
         """
         if stride < 1:
             raise ValueError(f"stride {stride} must be at least 1")
-        indices = range(len(self))[start:stop:stride]
-        if prepare is None:
-            return prefetched(self._decoded(indices), prefetch)
-        return prefetched(((f, prepare(f)) for f in self._decoded(indices)), prefetch)
+        return prefetched(self._decoded(range(len(self))[start:stop:stride]), prefetch)
 
     def _decoded(self, indices: range) -> Iterator[Frame]:
         for index in indices:

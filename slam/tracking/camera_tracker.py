@@ -148,15 +148,15 @@ class CameraTracker:
         self._recent_ids = self._recent_ids[~np.isin(self._recent_ids, landmark_ids)]
 
     def track(self, features: Features) -> Tracked:
-        """The frame's pose; where there is no map, or it is long lost, the frame begins one.
+        """The frame's pose, also in another segment; one that is long lost begins a segment.
 
-        A frame that begins a map segment has the pose of the segment's origin, and must become
-        its first keyframe. Where odometry knows the way none begins.
+        A frame that begins a segment has the pose of its origin, and must become its first
+        keyframe. Where odometry knows the way none begins.
         """
         can_begin = self.can_begin(features)
         if self.reference is None:
             return untracked(np.eye(4), features) if can_begin else lost(np.eye(4), features)
-        tracked = self.track_in_map(features)
+        tracked = self.track_in_map(features, everywhere=True)
         waits = self.lost_frames <= self._relocalisation.patience_frames or not can_begin
         if waits or tracked.status is not TrackingStatus.LOST:
             return tracked
@@ -165,8 +165,10 @@ class CameraTracker:
         self.restart(np.eye(4))
         return untracked(np.eye(4), features)
 
-    def track_in_map(self, features: Features) -> Tracked:
-        """The pose by constant velocity and the local map; when lost, by all keyframes.
+    def track_in_map(self, features: Features, everywhere: bool = False) -> Tracked:
+        """The pose by constant velocity and the local map; when lost, by the segment's keyframes.
+
+        ``everywhere``: by all keyframes, and tracking goes on in the segment that it is found in.
 
         Raises:
             ValueError: no map has been begun.
@@ -177,7 +179,7 @@ class CameraTracker:
         self._local_ids = world.landmarks.remaining(self._local_ids)
         tracked = self._tracked_in_image(features)
         if tracked.status is TrackingStatus.LOST:
-            tracked = self.recognise(features, world.in_segment(self.reference.segment)) or tracked
+            tracked = self._found_again(features, everywhere) or tracked
         if tracked.status is TrackingStatus.LOST:
             self.lost_frames += 1
             self._images.end_frame()
@@ -187,18 +189,23 @@ class CameraTracker:
         world.landmarks.found[tracked.landmark_ids] += 1
         return tracked
 
+    def _found_again(self, features: Features, everywhere: bool) -> Tracked | None:
+        """A frame's pose in a segment, which is tracked in from then on; None if not found."""
+        world = self._map.world
+        known = list(world.keyframes.values()) if everywhere else world.in_segment(self.segment)
+        tracked = self.recognise(features, known)
+        if tracked is not None:
+            _, nearest = world.covisible(tracked.landmark_ids, 1)[0]
+            if nearest.segment != self.segment:
+                self.refer_to(nearest)
+                self.segment = nearest.segment
+        return tracked
+
     def recognise(self, features: Features, keyframes: list[Keyframe]) -> Tracked | None:
         """The frame's pose against some keyframes, without a prior; None if it is not there."""
-        min_votes = self._relocalisation.min_votes
-        candidates = similar_keyframes(features, keyframes, self._map.places, min_votes)
-        return relocalise(
-            features,
-            candidates,
-            self._map.world,
-            self.tracker,
-            self._relocalisation,
-            self._local_map,
-        )
+        world, rules = self._map.world, self._relocalisation
+        candidates = similar_keyframes(features, keyframes, self._map.places, rules.min_votes)
+        return relocalise(features, candidates, world, self.tracker, rules, self._local_map)
 
     def update_motion(
         self, T_world_tracked: Array, T_world_camera: Array, landmark_ids: Ints
@@ -224,8 +231,7 @@ class CameraTracker:
     def follow_map(self, T_old: Array, T_new: Array) -> None:
         """The map was moved by its owner, as a keyframe from T_old to T_new (4, 4).
 
-        The last pose is moved with it, and landmarks that were fused since are replaced. The owner
-        may have restarted with fewer landmarks.
+        The last pose moves with it, and fused landmarks are replaced; a new owner may have fewer.
         """
         landmarks = self._map.world.landmarks
         self._motion.follow_map(T_old, T_new)

@@ -21,6 +21,7 @@ from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.tracking.pose_optimisation import (
     PoseEstimate,
     PoseOptimisationConfig,
+    median,
     optimise_pose,
 )
 from bmask_slam.tracking.rolling_shutter import share_of_rows
@@ -139,7 +140,7 @@ class ImageMotion:
         if not front.any():
             return 0.0
         apart = self.camera.project(expected[front]) - self.camera.project(there[front])
-        return float(np.median(np.linalg.norm(apart, axis=1)))
+        return median(np.linalg.norm(apart, axis=1))
 
     def view(
         self,

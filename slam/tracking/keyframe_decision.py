@@ -14,6 +14,8 @@ from bmask_slam.world.world_map import Keyframe
 
 CLOSE_BASELINES = 40
 """A point is close within so many baselines (ORB-SLAM2, section III.A)."""
+STARVING = "close points run out"
+"""Why a frame becomes a keyframe by ORB-SLAM2's extra rule."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,9 @@ class KeyframeConfig:
     place the keyframe. The reference keyframe is the last one. If another keyframe shares more with
     a frame that is to become a keyframe, and at least ``known_shared`` of its points, that one
     becomes the reference, and the next frame is decided against it: a known view needs no new
-    keyframe. With ``max_shared`` of 1 or more this rule is off.
+    keyframe. Nor do close points that run out where a keyframe shares half of its points, from
+    ``known_after_s`` before: those that could be made were made then, and are not found again. With
+    ``max_shared`` of 1 or more these rules are off.
     "paper" (Algorithm 2 as printed): at least ``paper_interval_frames`` since the last keyframe AND
     mapping idle AND less than ``paper_shared`` shared AND at least ``paper_min_matches`` matches.
     """
@@ -47,6 +51,7 @@ class KeyframeConfig:
     late_shared: float = 0.6
     urgent_shared: float = 0.4
     known_shared: float = 0.25
+    known_after_s: float = 20.0
     min_close_tracked: int = 100
     min_close_new: int = 70
     paper_interval_frames: int = 30
@@ -106,7 +111,8 @@ class KeyframeDecision:
         if not self._map.accepts_keyframes:
             return ""
         reason = keyframe_reason(self._evidence(tracked, reference), self.config)
-        return "" if reason and self._known_view(tracked.landmark_ids, reference) else reason
+        known = bool(reason) and self._known_view(tracked.landmark_ids, reference, reason)
+        return "" if known else reason
 
     def _evidence(self, tracked: Tracked, reference: Keyframe) -> KeyframeEvidence:
         _, points = self._map.world.observed(reference)
@@ -121,11 +127,16 @@ class KeyframeDecision:
             close_new=int(close.sum()) - close_tracked,
         )
 
-    def _known_view(self, landmark_ids: Ints, reference: Keyframe) -> bool:
-        """Whether another keyframe shows most of these landmarks; it is the reference then."""
+    def _known_view(self, landmark_ids: Ints, reference: Keyframe, reason: str) -> bool:
+        """Whether another keyframe shows most of these landmarks; it is the reference then.
+
+        If close points run out: whether an old one, or the reference itself if it is old, does.
+        """
         if self.config.max_shared >= 1:
             return False
         strong = self._map.world.covisible(landmark_ids, 1)
+        if reason == STARVING and self._is_revisited(strong):
+            return True
         if not strong or strong[0][1] is reference:
             return False
         shared, other = strong[0]
@@ -134,6 +145,15 @@ class KeyframeDecision:
             return False
         self._camera_tracker.refer_to(other)
         return True
+
+    def _is_revisited(self, strong: list[tuple[int, Keyframe]]) -> bool:
+        """Whether an old keyframe shares half of its points."""
+        now_s, after_s = self._camera_tracker.timestamp_s, self.config.known_after_s
+        return any(
+            abs(now_s - keyframe.timestamp_s) >= after_s
+            and shared >= self.config.max_shared * len(self._map.world.observed(keyframe)[1])
+            for shared, keyframe in strong
+        )
 
 
 def keyframe_reason(evidence: KeyframeEvidence, config: KeyframeConfig) -> str:
@@ -148,7 +168,7 @@ def keyframe_reason(evidence: KeyframeEvidence, config: KeyframeConfig) -> str:
         and evidence.close_new > config.min_close_new
     )
     if starving:
-        return "close points run out"
+        return STARVING
     overdue = evidence.frames_since > config.max_interval_frames
     ready = evidence.mapping_idle or overdue or urgent
     late = evidence.frames_since >= config.late_frames

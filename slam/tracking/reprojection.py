@@ -67,12 +67,10 @@ class Reprojection:
         points[:2] *= points[2]
         return self.focal * points + self.offset, points, z
 
-    def chi2(self, T_world_camera: Array) -> tuple[Array, Array, Array]:
-        """Weighted squares (N,), those of u and v alone (N,), and z (N,) m."""
+    def squares(self, T_world_camera: Array) -> tuple[Array, Array]:
+        """Squares (3, N) of the residuals in px^2, not weighted, and z (N,) m."""
         r, _, z = self.residuals(T_world_camera)
-        squares = r * r * self.weight
-        pixel = squares[0] + squares[1]
-        return pixel + squares[2], pixel, z
+        return r * r, z
 
     def normal_equations(
         self, T_world_camera: Array, kernel: Array | None = None
@@ -83,29 +81,26 @@ class Reprojection:
         [[nx ny, -1 - nx^2, ny, -i, 0, nx i], [1 + ny^2, -nx ny, -nx, 0, -i, ny i]] and
         d(i)/d(xi) = i [ny, -nx, 0, 0, 0, i].
         """
-        r, (nx, ny, i), _ = self.residuals(T_world_camera)
-        weight = self.weight
+        r, image, _ = self.residuals(T_world_camera)
+        (nx, ny, i), weight = image, self.weight
         if kernel is not None:
             chi2 = np.einsum("ij,ij,ij->j", r, r, weight)
             weight = weight * (kernel / (kernel + chi2))
         root = np.sqrt(weight)
-        su, sv, sd = root * self.focal
-        J = np.zeros((7, 3, len(self)))
-        su_i, sv_i, sd_i = su * i, sv * i, sd * i
-        su_nx, sv_ny = su * nx, sv * ny
+        scaled = root * self.focal
+        (su, sv, _), scaled_i, (su_nx, sv_ny, sd_i) = scaled, scaled * i, scaled * image
+        J, minus_nx = np.zeros((7, 3, len(self))), -nx
         np.multiply(su_nx, ny, out=J[0, 0])
-        np.subtract(-su, su_nx * nx, out=J[1, 0])
-        np.multiply(su, ny, out=J[2, 0])
-        np.negative(su_i, out=J[3, 0])
-        np.multiply(su_i, nx, out=J[5, 0])
         np.add(sv, sv_ny * ny, out=J[0, 1])
-        np.multiply(sv_ny, -nx, out=J[1, 1])
-        np.multiply(sv, -nx, out=J[2, 1])
-        np.negative(sv_i, out=J[4, 1])
-        np.multiply(sv_i, ny, out=J[5, 1])
         np.multiply(sd_i, ny, out=J[0, 2])
-        np.multiply(sd_i, -nx, out=J[1, 2])
-        np.multiply(sd_i, i, out=J[5, 2])
+        np.subtract(-su, su_nx * nx, out=J[1, 0])
+        np.multiply(sv_ny, minus_nx, out=J[1, 1])
+        np.multiply(sd_i, minus_nx, out=J[1, 2])
+        np.multiply(su, ny, out=J[2, 0])
+        np.multiply(sv, minus_nx, out=J[2, 1])
+        np.negative(scaled_i[0], out=J[3, 0])
+        np.negative(scaled_i[1], out=J[4, 1])
+        np.multiply(scaled_i, image, out=J[5])
         np.multiply(root, r, out=J[6])
         rows = J.reshape(7, -1)
         products = rows @ rows.T

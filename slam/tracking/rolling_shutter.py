@@ -16,7 +16,7 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, se3_log
-from bmask_slam.tracking.pose_optimisation import PoseEstimate, jacobian, residuals
+from bmask_slam.tracking.pose_optimisation import PoseEstimate, jacobian, median, residuals
 
 ACCELERATION = 2.0
 """Standard deviation of the acceleration of a hand-held camera, in rad/s^2 and m/s^2."""
@@ -64,7 +64,9 @@ def velocities(points_camera: Array, twist: Array) -> Array:
 
     With angular velocity w and velocity v, twist (6,) or (N, 6), this is - w x p - v.
     """
-    return -np.cross(twist[..., :3], points_camera) - twist[..., 3:]
+    (x, y, z), (a, b, c) = points_camera.T, twist.T[:3]
+    turning = np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=1)
+    return -turning - twist[..., 3:]
 
 
 def at_one_moment(features: Features, camera: Camera, motion: Motion | None) -> Features:
@@ -76,7 +78,7 @@ def at_one_moment(features: Features, camera: Camera, motion: Motion | None) -> 
         return features
     later_s = after_mean_row_s(features, camera)
     known = np.isfinite(features.depth_m)
-    usual_m = np.median(features.depth_m[known]) if known.any() else FAR_M
+    usual_m = median(features.depth_m[known]) if known.any() else FAR_M
     points = camera.backproject(features.pixels, np.where(known, features.depth_m, usual_m))
     points = points - later_s[:, None] * velocities(points, motion.twist)
     depth_m = np.where(known, points[:, 2], np.nan)

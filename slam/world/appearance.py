@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -27,14 +27,22 @@ APPEARANCE: Columns = {
 ON_DISK = "patches"  # 1.2 of the 1.4 kB of a row
 
 
+@dataclass
+class Revisions:
+    """When each row (R,) was last written, by a count that rises whenever a reader asks."""
+
+    rows: Ints = field(default_factory=lambda: np.zeros(1, np.int32))
+    now: int = 1
+
+
 class Appearance:
     """A column over landmark ids that has rows only for landmarks in the map.
 
     Row 0 is a placeholder for all removed landmarks: it stays zero when it is written.
     """
 
-    def __init__(self, column: NDArray | DiskRows, row: Ints) -> None:
-        self._column, self._row_of = column, row
+    def __init__(self, column: NDArray | DiskRows, row: Ints, revisions: Revisions) -> None:
+        self._column, self._row_of, self._revisions = column, row, revisions
 
     @property
     def _rows(self) -> NDArray:
@@ -49,6 +57,7 @@ class Appearance:
 
     def __setitem__(self, ids: Any, values: Any) -> None:
         column = self._column
+        self._revisions.rows[self._row_of[ids]] = self._revisions.now
         if isinstance(column, DiskRows):
             at = np.atleast_1d(self._row_of[ids])
             values = np.broadcast_to(values, (len(at), *column.rows.shape[1:]))
@@ -86,6 +95,9 @@ class AppearanceTable:
     """The rows of the appearance of all landmarks in the map; rows that are free are used again.
 
     Row 0 is a placeholder. Image patches lie on the disk, the other columns in memory.
+
+    Attributes:
+        revisions: of the rows.
     """
 
     def __init__(self) -> None:
@@ -94,6 +106,7 @@ class AppearanceTable:
             for name, column in APPEARANCE.items()
             for shape, dtype, _ in (column,)
         }
+        self.revisions = Revisions()
         self._free: list[int] = []
 
     def __len__(self) -> int:
@@ -103,7 +116,9 @@ class AppearanceTable:
 
     def views(self, row: Ints) -> dict[str, Appearance]:
         """The columns by name, over landmark ids (N,) whose rows are given."""
-        return {name: Appearance(column, row) for name, column in self._columns.items()}
+        return {
+            name: Appearance(column, row, self.revisions) for name, column in self._columns.items()
+        }
 
     def reserve(self, count: int) -> bool:
         """Make room for so many more landmarks; whether the columns are other ones now."""
@@ -117,6 +132,8 @@ class AppearanceTable:
             else:
                 new = filled(more, APPEARANCE[name])
                 self._columns[name] = np.concatenate([column, new])
+        known = self.revisions.rows
+        self.revisions.rows = np.concatenate([known, np.zeros(more, known.dtype)])
         self._free += range(capacity + more - 1, capacity - 1, -1)
         return True
 

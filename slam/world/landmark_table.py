@@ -120,6 +120,12 @@ class LandmarkTable:
         self._assign_rows(np.flatnonzero((self.row == 0) & in_map))
         self.in_map[:] = in_map
 
+    def written_since(self, revision: int) -> tuple[Mask, int]:
+        """Landmarks (N,) whose appearance was written after a revision, and the present one."""
+        revisions = self._appearance.revisions
+        revisions.now += 1
+        return revisions.rows[self.row] > revision, revisions.now - 1
+
     def remaining(self, ids: Ints) -> Ints:
         """Those of the ids that are in the map."""
         ids = ids[ids >= 0]

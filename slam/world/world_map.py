@@ -32,6 +32,7 @@ class Keyframe:
         landmark_ids: (N,) landmark of every keypoint, -1 for none.
         sent_ids: (N,) the landmark for which a keypoint's observation was sent to the graph, or -1.
         masked: (N,) keypoints on something that moves: they observe no landmark and make none.
+        revision: rises with each change of its observations or masks by ``WorldMap``.
     """
 
     id: int
@@ -43,6 +44,7 @@ class Keyframe:
     landmark_ids: Ints
     sent_ids: Ints = field(init=False)
     masked: Mask = field(init=False)
+    revision: int = 0
 
     def __post_init__(self) -> None:
         self.sent_ids = np.full(len(self.landmark_ids), -1, np.int64)
@@ -144,6 +146,7 @@ class WorldMap:
         usable = ~keyframe.masked[keypoints]
         keypoints, landmark_ids = keypoints[usable], landmark_ids[usable]
         keyframe.landmark_ids[keypoints] = landmark_ids
+        keyframe.revision += 1
         self.landmarks.observations[landmark_ids] += 1
         self._refresh(keyframe, keypoints, landmark_ids)
 
@@ -158,6 +161,7 @@ class WorldMap:
     def unmask(self, keyframe: Keyframe, keypoints: Ints) -> None:
         """Record that keypoints (N,) of a keyframe lie on something static."""
         keyframe.masked[keypoints] = False
+        keyframe.revision += 1
 
     def detach(self, keyframe: Keyframe, keypoints: Ints) -> None:
         """Record that keypoints (N,) of a keyframe observe nothing.
@@ -165,6 +169,7 @@ class WorldMap:
         Landmarks whose appearance was from here get it from the newest keyframe that is left.
         """
         landmarks, ids = self.landmarks, keyframe.landmark_ids[keypoints]
+        keyframe.revision += 1
         keyframe.landmark_ids[keypoints] = keyframe.sent_ids[keypoints] = -1
         ids = landmarks.remaining(ids)
         landmarks.observations[ids] -= 1
@@ -201,6 +206,7 @@ class WorldMap:
         removed[landmark_ids] = True
         for keyframe in self.keyframes.values():
             rows = removed[keyframe.landmark_ids]
+            keyframe.revision += int(rows.any())
             keyframe.masked |= rows
             keyframe.landmark_ids[rows] = keyframe.sent_ids[rows] = -1
         self.landmarks.observations[landmark_ids] = 0
@@ -281,6 +287,7 @@ class WorldMap:
             repeated[first] = False
             keep = ~(occupied | repeated)
             keyframe.landmark_ids[rows[~keep]] = -1
+            keyframe.revision += 1
             self.attach(keyframe, rows[keep], targets[keep])
         np.add.at(self.landmarks.found, new_ids, self.landmarks.found[old_ids])
         np.add.at(self.landmarks.visible, new_ids, self.landmarks.visible[old_ids])

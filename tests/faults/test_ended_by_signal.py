@@ -67,7 +67,8 @@ def handler(arguments):
     print("started", flush=True)
     time.sleep(60)
 
-cli.make_parser = lambda: SimpleNamespace(parse_args=lambda _: SimpleNamespace(handler=handler))
+arguments = SimpleNamespace(handler=handler, verbose=False)
+cli.make_parser = lambda: SimpleNamespace(parse_args=lambda _: arguments)
 sys.exit(cli.main())
 """
 

@@ -57,7 +57,9 @@ def test_memory_that_runs_out(
         with RunFolder(tmp_path / "run"):
             raise ERRORS[what]
 
-    parser = SimpleNamespace(parse_args=lambda argv: SimpleNamespace(handler=handler))
+    parser = SimpleNamespace(
+        parse_args=lambda argv: SimpleNamespace(handler=handler, verbose=False)
+    )
     monkeypatch.setattr(cli, "make_parser", lambda: parser)
     assert cli.main([]) == 1
     assert capsys.readouterr().err.splitlines() == [f"error: {cli.MEMORY}"]

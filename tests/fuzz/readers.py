@@ -24,6 +24,7 @@ from engine import NUMBERS, TOKENS, Make, Reader
 from fake_run import CAMERA as SMALL_CAMERA
 from fake_run import FakeSystem, make_sequence
 from recorded_bags import write_bag
+from ros2_player import example_message
 from safetensors.torch import save
 from small_comparison import make_comparison
 from small_layouts import SMALL_LAYOUTS, SmallLayout, write_small
@@ -58,6 +59,8 @@ from bmask_slam.graph.trajectory_formats import (
     write_euroc,
     write_kitti,
 )
+from bmask_slam.live.ros2.dds import decoded, typestore
+from bmask_slam.live.ros2.sensors import ImageClock, Ros2Sensors
 from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
 from bmask_slam.mapping.inverse_depth.depth_map import DEPTH_FILE, read_depth_map
@@ -82,7 +85,14 @@ from bmask_slam.semantics.weights.stuff_weights import load_stuff
 from bmask_slam.semantics.weights.yolox_onnx import load_onnx
 from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.bags.bag_file import open_bag
-from bmask_slam.sequences.bags.ros_images import camera_of, colour_image, depth_image
+from bmask_slam.sequences.bags.ros_images import (
+    camera_of,
+    colour_image,
+    depth_image,
+    stamp_s,
+)
+from bmask_slam.sequences.bags.sensors import SensorTopics
+from bmask_slam.sequences.bags.topics import static_extrinsics
 from bmask_slam.sequences.cameras import read_camera
 from bmask_slam.sequences.lists import read_associations, read_pairs
 from bmask_slam.system import SlamSystem
@@ -594,6 +604,40 @@ def read_message(path: Path) -> None:
             read(message, "here")
 
 
+WIRE = {
+    "sensor_msgs/msg/Imu": "imu", "nav_msgs/msg/Odometry": "odometry",
+    "sensor_msgs/msg/NavSatFix": "position", "tf2_msgs/msg/TFMessage": "/tf_static",
+    "sensor_msgs/msg/CameraInfo": "", "sensor_msgs/msg/CompressedImage": "",
+}  # fmt: skip
+"""Types of messages that come over DDS, and what hears them."""
+
+
+def wire() -> tuple[bytes, ...]:
+    """The bytes of such messages, after a byte for the type."""
+    rng = np.random.default_rng(0)
+    return tuple(
+        bytes([k]) + bytes(typestore().serialize_cdr(example_message(name, rng), name))
+        for k, name in enumerate(WIRE)
+    )
+
+
+def hear(path: Path) -> None:
+    """Bytes as they come over DDS, to sensors and tf."""
+    data = path.read_bytes()
+    name = list(WIRE)[data[0] % len(WIRE)] if data else "sensor_msgs/msg/Imu"
+    message = decoded(data[1:], name)
+    if message is None:
+        raise InputError("not of the message's type")
+    if WIRE[name] == "/tf_static":
+        bag: Any = SimpleNamespace(path=path, messages=lambda _: [("/tf_static", message)])
+        static_extrinsics(bag, "a", "b")
+    elif WIRE[name]:
+        reader = SimpleNamespace(broken=0, take=lambda _: [message, message])
+        node: Any = SimpleNamespace(published=lambda: {"/s": name}, reader=lambda *_: reader)
+        sensors = Ros2Sensors(node, SensorTopics(**{WIRE[name]: "/s"}), 0.0)
+        sensors.take(ImageClock(stamp_s(message.header), 0.0))
+
+
 def follow_bag(path: Path) -> None:
     for _ in BagSource(path).frames():
         pass
@@ -791,6 +835,7 @@ def binary_readers(folder: Path) -> list[Reader]:
         ),
         Reader("bag as a source", "a.bag", follow_bag, (recorded["a.bag"],)),
         Reader("ROS message", "m.json", read_message, MESSAGES, json_maker(*MESSAGES)),
+        Reader("ROS 2 over DDS", "m.cdr", hear, wire()),
         Reader("mcap", "a.mcap", read_bag, (recorded["a.mcap"],)),
         Reader("ROS 2 database", "a.db3", read_bag, (recorded["a.db3"],)),
         Reader("ROS 2 metadata", "metadata.yaml", database, (recorded["metadata.yaml"],)),

@@ -51,7 +51,8 @@ ELSEWHERE = {
     "slam/dense/folder.py": "what it has just made",
     "slam/runtime/machine.py": "/proc",
     "slam/runtime/memory.py": "/proc",
-    "slam/comparison/report/report.py": "the project's own style",
+    "slam/live/processes/worker.py": "/proc",
+    "slam/reporting/page.py": "the project's own style",
 }
 """Modules that read without graph/files, and what."""
 

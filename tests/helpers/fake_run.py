@@ -73,11 +73,11 @@ class FakeSystem:
         self.finished = False
         self.restarts = 0
 
-    def prepare(self, frame: Frame) -> int:
+    def number(self, frame: Frame) -> int:
         return int(frame.rgb[0, 0, 0])
 
-    def process(self, frame: Frame, features: int | None = None) -> FrameResult:
-        k = self.prepare(frame) if features is None else features
+    def process(self, frame: Frame) -> FrameResult:
+        k = self.number(frame)
         self.on_frame(k)
         lost = k % 7 == 6
         self.events.begin_frame(frame.index, frame.timestamp_s)

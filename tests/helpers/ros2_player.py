@@ -1,25 +1,28 @@
 """A second process on a DDS domain: plays a moving camera before a plane, and keeps what it hears.
 
 Arguments: domain, rate in Hz, file for the received messages (JSON). Frames that are dropped do not
-matter: the camera goes to and fro until nobody listens any more.
+matter: the camera goes to and fro until standard input is closed.
 """
 
 from __future__ import annotations
 
 import json
+import select
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from synthetic_view import CAMERA, render_plane
 
-from bmask_slam.graph.geometry import se3_exp
-from bmask_slam.live.ros2.dds import LATCHED, SENSOR, STATE, Node
-from bmask_slam.live.ros2.outputs import header, type_name, typestore
+from bmask_slam.graph.geometry import inverse, make_pose, rotation_from_quaternion, se3_exp
+from bmask_slam.live.ros2.dds import LATCHED, SENSOR, STATE, Node, idl_struct
+from bmask_slam.live.ros2.messages import header, message, transform, type_name, typestore
+from bmask_slam.live.ros2.messages import pose as ros_pose
 
 COLOUR, DEPTH = "/camera/camera/color/image_raw", "/camera/camera/aligned_depth_to_color/image_raw"
-INFO = "/camera/camera/color/camera_info"
+INFO, WHEELS = "/camera/camera/color/camera_info", "/odom"
 HEARD = {
     "/bmask_slam/odometry": ("Odometry", STATE),
     "/bmask_slam/pose": ("PoseWithCovarianceStamped", STATE),
@@ -29,6 +32,10 @@ HEARD = {
     "/tf": ("TFMessage", STATE),
     "/tf_static": ("TFMessage", LATCHED),
 }
+T_BASE_CAMERA = make_pose(
+    rotation_from_quaternion(np.array([0.4, -0.5, 0.6, -0.5])), np.array([0.3, 0.1, 0.9])
+)
+T_ODOM_MAP = se3_exp(np.array([0, 0, 0.7, 3.0, -2.0, 0]))
 BEGIN_S = 1000.0
 LONGEST_S = 120.0
 PLACES = 10
@@ -42,6 +49,16 @@ def place(k: int) -> int:
 def pose(k: int) -> np.ndarray:
     """T_world_camera of a frame: sideways, and a turn."""
     return se3_exp(place(k) * np.array([0, 0.01, 0, 0.02, 0, 0]))
+
+
+def wheels(k: int) -> object:
+    """A nav_msgs/Odometry of a frame's time, in a frame of its own."""
+    T = inverse(pose(0)) @ pose(k)
+    T_odom_base = T_ODOM_MAP @ T_BASE_CAMERA @ T @ inverse(T_BASE_CAMERA)
+    zero = message("Vector3", 0.0, 0.0, 0.0)
+    twist = message("TwistWithCovariance", message("Twist", zero, zero), np.zeros(36))
+    known = message("PoseWithCovariance", ros_pose(T_odom_base), np.zeros(36))
+    return message("Odometry", header(BEGIN_S + k / 30, "odom"), "base_link", known, twist)
 
 
 def image(stamp_s: float, encoding: str, pixels: np.ndarray) -> object:
@@ -64,32 +81,58 @@ def info(stamp_s: float) -> object:
     )  # fmt: skip
 
 
+def example_message(name: str, rng: np.random.Generator, as_idl: bool = False) -> Any:
+    """A message with random values: of rosbags, or of the struct that cyclonedds knows."""
+    store = typestore()
+    values = {f: _value(kind, rng, as_idl) for f, kind in store.fielddefs[name][1]}
+    return (idl_struct(name) if as_idl else store.types[name])(**values)
+
+
+def _value(kind: Any, rng: np.random.Generator, as_idl: bool) -> Any:
+    node, described = kind[0].name, kind[1]
+    if node == "NAME":
+        return example_message(described, rng, as_idl)
+    if node == "BASE":
+        base = described[0]
+        if base == "string":
+            return "abcdefgh"[: int(rng.integers(0, 8))]
+        if base == "bool":
+            return bool(rng.integers(0, 2))
+        return float(np.float32(rng.normal())) if "float" in base else int(rng.integers(0, 100))
+    count = described[1] if node == "ARRAY" else int(rng.integers(1, 4))
+    values = [_value(described[0], rng, as_idl) for _ in range(count)]
+    if as_idl or described[0][0].name == "NAME" or described[0][1][0] == "string":
+        return values
+    return np.array(values, described[0][1][0])
+
+
 def main() -> None:
-    """Play frames until nothing has come for four seconds since the first pose."""
+    """Play frames until standard input is closed."""
     domain, rate_hz, out = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
     node = Node(domain)
     image_type = "sensor_msgs/msg/Image"
     colours = node.writer(COLOUR, image_type, SENSOR._replace(reliable=True))
     depths = node.writer(DEPTH, image_type, SENSOR._replace(reliable=True))
     infos = node.writer(INFO, "sensor_msgs/msg/CameraInfo", SENSOR._replace(reliable=True))
+    odometry = node.writer(WHEELS, type_name("Odometry"), SENSOR._replace(reliable=True))
+    static = node.writer("/tf_static", type_name("TFMessage"), LATCHED)
+    link = transform(0.0, ("base_link", "camera"), T_BASE_CAMERA)
+    static.send(message("TFMessage", [link]))
     readers = {t: node.reader(t, type_name(k), q) for t, (k, q) in HEARD.items()}
     heard: dict[str, list] = {topic: [] for topic in HEARD}
     rendered = [render_plane(pose(k), k) for k in range(PLACES)]
-    k, last_s = 0, time.monotonic()
-    end_s = last_s + LONGEST_S
-    while time.monotonic() < min(last_s + 4, end_s):
+    k, end_s, ends = 0, time.monotonic() + LONGEST_S, False
+    while not ends and time.monotonic() < end_s:
+        ends = bool(select.select([sys.stdin], [], [], 0)[0])  # what came until then is read
         for topic, reader in readers.items():
             for received in reader.take():
                 heard[topic].append(told(received))
-                last_s = time.monotonic()
         stamp_s, frame = BEGIN_S + k / 30, rendered[place(k)]
         infos.send(info(stamp_s))
+        odometry.send(wheels(k))
         colours.send(image(stamp_s, "rgb8", frame.rgb))
         depths.send(image(stamp_s, "32FC1", frame.depth_m.astype(np.float32)))
-        if heard["/tf"]:
-            k += 1
-        else:  # the first is repeated until somebody tracks: a camera is there before
-            last_s = time.monotonic()
+        k += bool(heard["/bmask_slam/odometry"])  # the first is repeated until somebody tracks
         time.sleep(1 / rate_hz)
     Path(out).write_text(json.dumps(heard))
 
@@ -106,7 +149,11 @@ def told(received: object) -> dict:
             "child": received.child_frame_id,
         }  # fmt: skip
     if name == "TFMessage":
-        return {"links": [[t.header.frame_id, t.child_frame_id] for t in received.transforms]}
+        moved = [t.transform.translation for t in received.transforms]
+        return {
+            "links": [[t.header.frame_id, t.child_frame_id] for t in received.transforms],
+            "moved": [[v.x, v.y, v.z] for v in moved],
+        }
     if name == "PointCloud2":
         return {"points": received.width, "fields": [f.name for f in received.fields]}
     if name == "DiagnosticArray":

@@ -35,7 +35,8 @@ from bmask_slam.world.appearance import PATCHES, Patches
 from bmask_slam.world.landmark_table import LandmarkTable
 
 FILE = Path("run/checkpoint")
-SCRATCH = {"elapsed_s", "stage_ms", "_disk"}  # mean nothing between two frames
+SCRATCH = {"elapsed_s", "stage_ms", "_disk", "_ahead", "_searcher", "revision"}
+"""Nothing between two frames; counts of changes in this process."""
 OPAQUE = ("cv2", "gtsam", "faiss")  # made anew from configuration or state
 SETTINGS = [  # a keyframe nearly every frame, and most of them culled again
     *("keyframes.min_interval_frames=1", "keyframes.max_shared=2.0"),

@@ -16,13 +16,13 @@ from bmask_slam.comparison.experiment.experiment import (
     Quotation,
     SequenceSource,
 )
-from bmask_slam.comparison.experiment.metric_table import BY_NAME
 from bmask_slam.config.configuration import find_config, from_tree, resolve
 from bmask_slam.graph.data_files import data_path
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.files.yaml_file import read_yaml
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S
 from bmask_slam.rendering.sequence import SCENES, RenderConfig
+from bmask_slam.reporting.metric_table import BY_NAME
 from bmask_slam.system_config import SystemConfig
 
 NAME = re.compile(r"[^/\\@=:\n]{1,60}")
@@ -50,7 +50,8 @@ class _Settings:
             )
         for name in self.verdicts:
             if name not in BY_NAME or BY_NAME[name].lower_is_better is None:
-                raise ValueError(f"verdicts: {name!r} cannot be judged; {_metrics(judged=True)}")
+                cure = f"{_metrics(judged=True)}{did_you_mean(str(name), BY_NAME)}"
+                raise ValueError(f"verdicts: {name!r} cannot be judged; {cure}")
 
 
 @dataclass(frozen=True)
@@ -187,7 +188,7 @@ def _quotations(file: Path, tree: Any) -> Iterator[Quotation]:
             if key not in ("method", "source", "with_scale"):
                 raise InputError(
                     f"{where}: unknown key {key}; there are: method, source, with_scale and a "
-                    f"metric ({_metrics()})"
+                    f"metric ({_metrics()}){did_you_mean(key, BY_NAME)}"
                 )
         for key in ("method", "source"):
             if not isinstance(keys.get(key), str) or not keys[key].strip():

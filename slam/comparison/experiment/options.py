@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import glob
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
 from bmask_slam.comparison.experiment.experiment import Experiment, OtherSystem
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, did_you_mean
 
+EVERY, NAMED = "*", "{sequence}"
 Value = TypeVar("Value")
 Files = dict[tuple[str, str], Path]
-"""Trajectory file by method and SEQUENCE or SEQUENCE@SEED."""
+"""Trajectory file by method and SEQUENCE or SEQUENCE@SEED; of EVERY sequence a pattern."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,10 @@ class CompareOptions:
 
 
 def parse_trajectory(text: str) -> tuple[tuple[str, str], Path]:
-    """``METHOD:SEQUENCE=FILE`` or ``METHOD:SEQUENCE@SEED=FILE``. Raises InputError."""
+    """``METHOD:SEQUENCE=FILE``, ``METHOD:SEQUENCE@SEED=FILE`` or ``METHOD:*=PATTERN``.
+
+    Raises InputError.
+    """
     name, separator, file = text.partition("=")
     method, colon, sequence = name.rpartition(":")
     if not (separator and colon and method and sequence and file):
@@ -65,7 +70,7 @@ def with_trajectories(experiment: Experiment, files: Files) -> Experiment:
         InputError: a file that does not exist, an unknown sequence, or a method's name in use.
     """
     systems = dict(experiment.systems)
-    for (method, sequence), file in files.items():
+    for (method, sequence), file in _without_patterns(experiment, files).items():
         known = [s.name for s in experiment.sequences]
         if sequence.partition("@")[0] not in known:
             raise InputError(
@@ -80,6 +85,32 @@ def with_trajectories(experiment: Experiment, files: Files) -> Experiment:
         given = {**system.trajectories, sequence: str(file.absolute())}
         systems[method] = replace(system, trajectories=given)
     return replace(experiment, systems=systems)
+
+
+def _without_patterns(experiment: Experiment, files: Files) -> Files:
+    """The files with those that a pattern stands for, one for each sequence that has one.
+
+    In the pattern of the sequence ``*`` ``{sequence}`` is the sequence's name, other ``*`` and
+    ``?`` are those of a shell. Raises InputError if a pattern fits no file, or several.
+    """
+    found = {key: file for key, file in files.items() if key[1] != EVERY}
+    for (method, sequence), pattern in files.items():
+        if sequence != EVERY:
+            continue
+        where = f"--trajectory {method}:*={pattern}"
+        if NAMED not in str(pattern):
+            raise InputError(f"{where}: write {NAMED} where the name of the sequence stands")
+        before = len(found)
+        for source in experiment.sequences:
+            text = str(pattern).replace(NAMED, glob.escape(source.name))
+            fitting = sorted(glob.glob(text, recursive=True))
+            if len(fitting) > 1:
+                raise InputError(f"{where}: {fitting[0]} and {fitting[1]} fit; make it narrower")
+            if fitting:
+                found[method, source.name] = Path(fitting[0])
+        if len(found) == before:
+            raise InputError(f"{where}: no file fits for any sequence; correct the pattern")
+    return found
 
 
 def select_part(experiment: Experiment, options: CompareOptions) -> Experiment:
@@ -140,5 +171,7 @@ def _check(
 ) -> None:
     unknown = [name for name in names or () if name not in known]
     if unknown:
-        listed = ", ".join(known)
-        raise InputError(f"{flag} {unknown[0]}: not in {experiment.file}; there are: {listed}")
+        listed, near = ", ".join(known), did_you_mean(unknown[0], known)
+        raise InputError(
+            f"{flag} {unknown[0]}: not in {experiment.file}; there are: {listed}{near}"
+        )

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 RESULTS = "results.json"
 FORMAT_VERSION = 1
+MIN_COVERAGE = 0.95
+"""An error of a trajectory that covers less of its sequence is shown, but never compared."""
 
 
 class Kind(Enum):
@@ -69,7 +71,7 @@ class Cell:
         sequence, method: their names.
         seed: of a run; None where there is none.
         status: DONE, FAILED or PENDING.
-        metrics: value by metric name (`comparison.experiment.metric_table`), those that exist.
+        metrics: value by metric name (`reporting.metric_table`), those that exist.
         folder: the run folder, relative to the comparison's; "" without one.
         trajectory, reference: TUM files that were compared, relative to the comparison's folder or
             absolute; "" without.
@@ -89,6 +91,11 @@ class Cell:
     log: str = ""
     error: str = ""
     source: str = ""
+
+    @property
+    def coverage(self) -> float:
+        """The share of the frames that have a pose; 1 where their number is not known."""
+        return self.metrics.get("tracked_share", 1.0)
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from bmask_slam.comparison.experiment.metric_table import BY_NAME
 from bmask_slam.evaluation import evaluate_trajectory, read_reference
 from bmask_slam.graph.trajectory_formats import read_trajectory
+from bmask_slam.reporting.metric_table import BY_NAME
 from bmask_slam.run_folder.reader import Run
 
 COMPARISON_NAMES = {"estimate_share": "evaluated_share"}
@@ -45,5 +45,5 @@ def run_figures(run: Path) -> dict[str, float]:
     return {
         name: float(metric.value)
         for name, metric in Run(run).metrics.items()
-        if name in BY_NAME and not name.startswith(("ate_", "rpe_"))
+        if name in BY_NAME and not name.startswith(("ate_", "rpe_", "drift_"))
     }

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.comparison.experiment.result import Comparison
-from bmask_slam.comparison.report.drawing import COLOURS, DASHES, as_picture, figure
-from bmask_slam.comparison.report.section import Picture
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError, finite_number, whole_number
 from bmask_slam.graph.files.reading import read_table
+from bmask_slam.reporting.drawing import COLOURS, DASHES, as_picture, figure
+from bmask_slam.reporting.parts import Picture
 
 LOSSES, CURVES = "losses.csv", "precision_recall.csv"
 TOTAL, MASKS = "total", "segm, by class score x MaskIoU"

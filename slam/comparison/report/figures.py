@@ -12,8 +12,6 @@ from matplotlib.axes import Axes
 
 from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Method
 from bmask_slam.comparison.jobs.errors import Rules
-from bmask_slam.comparison.report.drawing import as_picture, figure
-from bmask_slam.comparison.report.section import Picture
 from bmask_slam.comparison.report.table import ATE, values
 from bmask_slam.evaluation import evaluate_trajectory, read_reference
 from bmask_slam.evaluation.plot import draw_top_view
@@ -21,6 +19,8 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.metrics import AbsoluteError, RelativeError
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate
 from bmask_slam.graph.trajectory_formats import read_trajectory
+from bmask_slam.reporting.drawing import as_picture, figure
+from bmask_slam.reporting.parts import Picture
 
 MAX_DIFFERENCES = 300
 VISIBLE_SHARE = 0.04  # of the path's extent, for an RMSE

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import jinja2
-from markupsafe import Markup
-
 from bmask_slam.comparison.experiment.result import Comparison
-from bmask_slam.comparison.report.section import Section, slug
 from bmask_slam.comparison.report.sections import make_sections, summary
 from bmask_slam.comparison.report.table import metric_tables
 from bmask_slam.comparison.report.text_tables import csv_text, latex_text, markdown_text
 from bmask_slam.comparison.report.verdict_tables import ablation_table, verdict_tables
 from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.reporting.page import Page, page_text
+from bmask_slam.reporting.parts import Section, slug
 
 PAGE = "report.html"
 FIGURES = "figures"
-TEMPLATES = Path(__file__).parent
 
 
 def write_report(comparison: Comparison, folder: Path) -> list[Path]:
@@ -33,12 +30,14 @@ def write_report(comparison: Comparison, folder: Path) -> list[Path]:
     tables += verdict_tables(comparison)
     title = comparison.title or comparison.name
     texts = {
-        PAGE: _html_text(title, comparison.description, sentences, sections),
+        PAGE: page_text(Page(title, comparison.description, sentences, sections)),
         "tables.csv": csv_text(comparison),
         "tables.md": markdown_text(tables, title),
         "tables.tex": latex_text(tables),
     }
-    written = [_write(folder / name, text.encode("utf-8")) for name, text in texts.items()]
+    written = [
+        _write(folder / name, text.encode("utf-8", "replace")) for name, text in texts.items()
+    ]
     return written + _write_figures(folder / FIGURES, sections)
 
 
@@ -61,19 +60,3 @@ def _write(path: Path, data: bytes) -> Path:
     with whole_file(path) as temporary:
         temporary.write_bytes(data)
     return path
-
-
-def _html_text(title: str, description: str, sentences: list[str], sections: list[Section]) -> str:
-    """The page; every text is escaped."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-    )
-    css = (TEMPLATES / "page.css").read_text(encoding="utf-8")
-    style = Markup(css)  # nosec B704 # the project's own file
-    page = environment.get_template("page.html.j2")
-    return page.render(
-        title=title, description=description, summary=sentences, sections=sections, style=style
-    )

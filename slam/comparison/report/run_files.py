@@ -6,16 +6,15 @@ import logging
 from collections import Counter, defaultdict
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind
-from bmask_slam.comparison.report.section import Picture, slug
-from bmask_slam.comparison.report.table import EMPTY, Entry, Table, TableRow
+from bmask_slam.comparison.report.table import EMPTY
 from bmask_slam.events import EventKind, read_events
 from bmask_slam.graph.errors import InputError
+from bmask_slam.reporting.parts import Entry, Picture, Table, TableRow, slug
+from bmask_slam.reporting.picture_files import read_picture
 from bmask_slam.run_folder.frame_file import FRAMES, STAGES, read_frames
-from bmask_slam.semantics.instances.image_files import decode_image
 
 KEYFRAME_STAGES = ("keyframe", "graph", "loops", "semantics")
 PICTURE_WIDTH_PX = 900
@@ -107,15 +106,7 @@ def _map_picture(path: Path, cell: Cell, shows: str) -> Picture | None:
     if not path.is_file():
         return None
     try:
-        image = decode_image(path, cv2.IMREAD_COLOR)
+        return read_picture(path, f"{cell.sequence}, {cell.method}: {shows}", PICTURE_WIDTH_PX)
     except InputError as error:
         logger.warning("%s; skipped in the report", error)
         return None
-    height, width = image.shape[:2]
-    if width > PICTURE_WIDTH_PX:
-        height = round(height * PICTURE_WIDTH_PX / width)
-        width = PICTURE_WIDTH_PX
-        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".png", image)[1].tobytes()
-    name = f"{cell.sequence}, {cell.method}"
-    return Picture(f"{name}: {shows}", f"{name}: {shows}.", data, "image/png", (width, height))

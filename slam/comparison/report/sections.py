@@ -7,14 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison
+from bmask_slam.comparison.experiment.result import MIN_COVERAGE, Cell, CellStatus, Comparison
 from bmask_slam.comparison.report.curves import network_pictures
 from bmask_slam.comparison.report.figures import error_pictures
 from bmask_slam.comparison.report.run_files import event_table, map_pictures, stage_table
-from bmask_slam.comparison.report.section import Listing, Section
 from bmask_slam.comparison.report.table import (
     ATE,
-    Table,
     cell_name,
     cell_tables,
     metric_table,
@@ -26,9 +24,11 @@ from bmask_slam.comparison.report.verdict_tables import (
     verdict_sentences,
     verdict_tables,
 )
+from bmask_slam.comparison.statistics import too_few, verdicts
 from bmask_slam.graph.files.file_names import is_inside
 from bmask_slam.graph.files.reading import read_text
 from bmask_slam.graph.files.yaml_file import format_yaml
+from bmask_slam.reporting.parts import Listing, Section, Table
 
 LOG_LINES = 15
 LINE_CHARACTERS = 400
@@ -46,7 +46,7 @@ def make_sections(comparison: Comparison, folder: Path) -> list[Section]:
         _stages(comparison, folder),
         *_maps(comparison, folder),
         Section("Networks", pictures=tuple(network_pictures(comparison, folder))),
-        Section("Every cell", tables=tuple(cell_tables(comparison))),
+        Section("Every cell", tables=tuple(cell_tables(comparison)), printed=False),
         _provenance(comparison),
     ]
     return [section for section in sections if not section.empty]
@@ -87,15 +87,17 @@ def _absolute_errors(comparison: Comparison) -> Section:
     text = (
         "Best figures measured here are bold; published figures are quoted from their sources and "
         "were not measured here. Alignment is SE(3) unless a row is marked Sim(3). A sequence with "
-        "a failed run is marked, and is not compared for the best.",
+        "a failed run is marked, and is not compared for the best; nor is one of a trajectory that "
+        f"covers less than {100 * MIN_COVERAGE:.0f} % of the sequence, which is marked too.",
     )
     return Section("Absolute trajectory error", text, (table,)) if table else Section("")
 
 
 def _differences(comparison: Comparison) -> Section:
-    tables = verdict_tables(comparison)
+    few = too_few(verdicts(comparison))
+    tables = [] if few else verdict_tables(comparison)
     ablation = ablation_table(comparison)
-    text = (RULE,) if tables else ()
+    text = (RULE,) if tables else ()  # that they are too few is in the summary
     return Section("Differences", text, (*([ablation] if ablation else []), *tables))
 
 
@@ -124,7 +126,8 @@ def _error_figures(comparison: Comparison, folder: Path) -> list[Section]:
 
 def _other_metrics(comparison: Comparison) -> Section:
     tables = [table for table in metric_tables(comparison) if table.name != ATE.name]
-    return Section("Other metrics", tables=tuple(_without_notes(table) for table in tables))
+    shown = tuple(_without_notes(table) for table in tables)
+    return Section("Other metrics", tables=shown, printed=False)
 
 
 def _without_notes(table: Table) -> Table:
@@ -134,12 +137,14 @@ def _without_notes(table: Table) -> Table:
 
 def _stages(comparison: Comparison, folder: Path) -> Section:
     table = stage_table(comparison, folder)
-    return Section("Time", tables=(table,) if table else ())
+    return Section("Time", tables=(table,) if table else (), printed=False)
 
 
 def _maps(comparison: Comparison, folder: Path) -> list[Section]:
     return [
-        Section(f"Map of {name}", pictures=tuple(map_pictures(comparison, name, folder)))
+        Section(
+            f"Map of {name}", pictures=tuple(map_pictures(comparison, name, folder)), printed=False
+        )
         for name in comparison.sequences
     ]
 
@@ -153,7 +158,7 @@ def _provenance(comparison: Comparison) -> Section:
     listings += [
         Listing(name.capitalize(), _as_text(value)) for name, value in long.items() if value
     ]
-    return Section("How it was made", listings=tuple(listings))
+    return Section("How it was made", listings=tuple(listings), printed=False)
 
 
 def _without_empty(value: Any) -> Any:

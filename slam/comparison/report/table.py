@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import isfinite
 from statistics import median
 
-from bmask_slam.comparison.experiment.metric_table import METRICS, Metric
-from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind, Method
+from bmask_slam.comparison.experiment.result import (
+    MIN_COVERAGE,
+    Cell,
+    CellStatus,
+    Comparison,
+    Kind,
+    Method,
+)
+from bmask_slam.reporting.metric_table import METRICS, Metric
+from bmask_slam.reporting.parts import Entry, Table, TableRow
 
 EMPTY = "–"
 FAILED = "failed"
@@ -16,53 +24,6 @@ PENDING = "pending"
 RANGE = " (smallest to largest)"
 ATE = METRICS[0]
 MAX_COLUMNS = 9  # of figures of single cells
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One cell of a table.
-
-    Attributes:
-        text: the figure, or a word without one.
-        spread: range over seeds; "" with one seed.
-        note: a remark on the figure, such as "1 of 3 failed".
-        best: whether it is the best measured here in its column.
-        failed: whether a run of it failed.
-    """
-
-    text: str
-    spread: str = ""
-    note: str = ""
-    best: bool = False
-    failed: bool = False
-
-    @property
-    def plain(self) -> str:
-        """Text, spread and note."""
-        spread = f" ({self.spread})" if self.spread else ""
-        return f"{self.text}{spread}{f' {self.note}' if self.note else ''}"
-
-
-@dataclass(frozen=True)
-class TableRow:
-    """A row: its name, entries, tags after the name, and the source of its figures."""
-
-    label: str
-    entries: tuple[Entry, ...]
-    tags: tuple[str, ...] = ()
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table; ``name`` is its file-safe name, ``corner`` the heading of the first column."""
-
-    name: str
-    title: str
-    caption: str
-    columns: tuple[str, ...]
-    rows: tuple[TableRow, ...]
-    corner: str = "method"
 
 
 def metric_tables(comparison: Comparison) -> list[Table]:
@@ -138,6 +99,7 @@ def _column(comparison: Comparison, sequence: str, metric: Metric) -> list[Entry
         if method.kind is not Kind.PUBLISHED
         and not method.with_scale
         and not entries[k].failed
+        and covered_share(cells) >= MIN_COVERAGE
         and (found := values(cells, metric))
     }
     if metric.lower_is_better is None or len(middle) < 2:
@@ -168,10 +130,17 @@ def _entry(cells: list[Cell], metric: Metric) -> Entry:
     return Entry(number(median(found), metric), spread, ", ".join(notes), failed=failed > 0)
 
 
+def covered_share(cells: Iterable[Cell]) -> float:
+    """The least share of the sequence that a cell which is done covers."""
+    return min((c.coverage for c in cells if c.status is CellStatus.DONE), default=1.0)
+
+
 def _share(cells: list[Cell]) -> list[str]:
-    """The share of the sequence that was evaluated, if not all of it."""
+    """The share of the sequence that has a pose, and that was evaluated, if not all of it."""
+    coverage = covered_share(cells)
+    covered = [f"covers {100 * coverage:.0f} %"] if coverage < MIN_COVERAGE else []
     shares = [c.metrics["evaluated_share"] for c in cells if "evaluated_share" in c.metrics]
-    return [f"over {100 * min(shares):.0f} %"] if shares and min(shares) < 0.995 else []
+    return covered + ([f"over {100 * min(shares):.0f} %"] if shares and min(shares) < 0.995 else [])
 
 
 def _cell_table(comparison: Comparison, sequence: str, metrics: list[Metric]) -> Table:

@@ -6,16 +6,16 @@ import csv
 import io
 import re
 
-from bmask_slam.comparison.experiment.metric_table import BY_NAME
 from bmask_slam.comparison.experiment.result import Comparison
-from bmask_slam.comparison.report.section import slug
-from bmask_slam.comparison.report.table import RANGE, Entry, Table, TableRow
+from bmask_slam.comparison.report.table import RANGE
+from bmask_slam.reporting.metric_table import BY_NAME
+from bmask_slam.reporting.parts import Entry, Table, TableRow, slug
 
 CSV_COLUMNS = ("sequence", "method", "kind", "with_scale", "seed", "status", "metric", "value",
                "unit", "error", "source")  # fmt: skip
 NARROW = 4  # columns of a table in which ranges have room
 HEAD_LETTERS = 12
-STORED_UNITS = {"cm": "m", "mm": "m", "%": "1", "°": "deg"}
+STORED_UNITS = {"cm": "m", "mm": "m", "%": "1", "°": "deg", "°/m": "deg/m"}
 LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
     "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from bmask_slam.comparison.experiment.metric_table import BY_NAME, Metric
+from math import isfinite
+
 from bmask_slam.comparison.experiment.result import CellStatus, Comparison, Kind
-from bmask_slam.comparison.report.table import ATE, EMPTY, Entry, Table, TableRow
+from bmask_slam.comparison.report.table import ATE, EMPTY
 from bmask_slam.comparison.statistics import (
     BETTER,
+    FEW_PAIRS,
     LEVEL,
     NO_DIFFERENCE,
     RESAMPLES,
     WORSE,
     Verdict,
     summarise,
+    too_few,
     verdicts,
 )
+from bmask_slam.reporting.metric_table import BY_NAME, Metric
+from bmask_slam.reporting.parts import Entry, Table, TableRow
 
 COLUMNS = ("judgement", "difference", "95 % interval", "better / worse of pairs", "p")
 RULE = (
@@ -39,8 +44,10 @@ def verdict_sentences(comparison: Comparison) -> list[str]:
         f"{ATE.title}: {v.method} is {v.judgement} than {v.baseline} by "
         f"{ATE.scale * abs(v.difference):.{ATE.digits}f} {ATE.unit} on the mean of {v.pairs} pairs."
         for v in found
-        if v.judgement != NO_DIFFERENCE
+        if v.judgement in (BETTER, WORSE)
     ]
+    if too_few(found):
+        return [f"{FEW_PAIRS}."]
     if found and not sentences:
         return [f"{ATE.title}: no difference from {found[0].baseline} is shown."]
     return sentences
@@ -63,7 +70,7 @@ def ablation_table(comparison: Comparison) -> Table | None:
         return None
     caption = (
         f"Median ATE against that of {runs[0].name} (%): positive: larger error. "
-        "Empty where a run of either failed."
+        "Empty where a run of either failed, or covers too little of the sequence."
     )
     return Table("ablation", f"ATE against {runs[0].name} (%)", caption, comparison.sequences, rows)
 
@@ -90,7 +97,7 @@ def _table(metric: Metric, found: list[Verdict]) -> Table:
 
 def _entries(metric: Metric, verdict: Verdict) -> tuple[Entry, ...]:
     def shown(value: float) -> str:
-        return f"{metric.scale * value:+.{metric.digits + 1}f}"
+        return f"{metric.scale * value:+.{metric.digits + 1}f}" if isfinite(value) else EMPTY
 
     incomplete = f"{verdict.incomplete} incomplete" if verdict.incomplete else ""
     return (

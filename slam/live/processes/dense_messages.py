@@ -25,6 +25,7 @@ class DenseSetup:
         masks: the segmenter that makes the masks.
         labels: names of its classes.
         shown: largest number of points of a submap for a viewer; 0: there is no viewer.
+        mesh_voxel_m: as in `MapOptions`.
     """
 
     run: Path
@@ -32,6 +33,7 @@ class DenseSetup:
     masks: SegmenterOptions
     labels: tuple[str, ...]
     shown: int = 0
+    mesh_voxel_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

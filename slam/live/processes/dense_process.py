@@ -89,7 +89,8 @@ class DenseServer:
         """Start a dense map, or continue one that another process left. Raises InputError."""
         self._setup, self._send, self._run = setup, send, setup.run
         self._labels = LabelSet(setup.labels)
-        self._options = resolve_options(MapOptions(setup.run, masks=setup.masks), self._labels)
+        asked = MapOptions(setup.run, masks=setup.masks, mesh_voxel_m=setup.mesh_voxel_m)
+        self._options = resolve_options(asked, self._labels)
         settings = folder_settings(self._options, self._labels)
         self._folder = RetryingFolder(setup.run, settings)
         self._fusion = KeyframeFusion(setup.camera, self._labels, self._folder, self._options)

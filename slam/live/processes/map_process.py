@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.back_end.reinterpretation import use_camera
-from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import read_arrays, write_arrays
@@ -33,15 +32,19 @@ from bmask_slam.live.messages import (
     Finish,
     LostKeyframe,
     MapChanged,
+    MapSaved,
     Masks,
     NewKeyframe,
+    ObjectsTold,
     PruneLandmarks,
     PruneMask,
     Ready,
     RestoreObservations,
+    SaveMap,
     SaveState,
     Started,
     StateSaved,
+    TellObjects,
     UseCamera,
     VisibilityCounts,
 )
@@ -128,21 +131,16 @@ class MapServer:
                 self.skip_keyframe(message)
             case Masks():
                 self.add_masks(message)
-            case PruneLandmarks():
-                self.prune_landmarks(message.ids)
-            case PruneMask():
-                mask = message.mask.unpacked()
-                self.system.map.prune_mask(message.keyframe_id, mask, message.widen_px)
-            case RestoreObservations():
-                back = message.keypoints, message.patches
-                self.system.map.restore_observations(message.keyframe_id, *back)
-                self.send_changes(-1, done=False)
+            case PruneLandmarks() | PruneMask() | RestoreObservations():
+                self.change_observations(message)
             case UseCamera():
                 self.use_camera(message)
             case AddMeasurements() | ChangeOwnFactors():
                 self.take_from_user(message)
             case SaveState():
                 self.save(number, message.path)
+            case TellObjects() | SaveMap():
+                self.answer(message)
             case Finish():
                 self.system.mapper.history.extend(message.history)
                 self.system.finish()
@@ -162,11 +160,22 @@ class MapServer:
             self.system.events.sensor(f"own factor refused: {error}", logging.WARNING)
         self.send_changes(-1, done=False)
 
-    def prune_landmarks(self, ids: Ints) -> None:
-        """Remove those of the landmarks (N,) that are still in the map."""
-        ids = self.system.mapper.world.landmarks.remaining(ids)
-        if len(ids):
-            self.system.map.prune_landmarks(ids)
+    def change_observations(
+        self, message: PruneLandmarks | PruneMask | RestoreObservations
+    ) -> None:
+        """Take out what moves, or put back what does not; landmarks that are gone are left out."""
+        editor = self.system.map
+        match message:
+            case PruneLandmarks():
+                ids = self.system.mapper.world.landmarks.remaining(message.ids)
+                if len(ids):
+                    editor.prune_landmarks(ids)
+            case PruneMask():
+                editor.prune_mask(message.keyframe_id, message.mask.unpacked(), message.widen_px)
+            case RestoreObservations():
+                back = message.keyframe_id, message.keypoints, message.patches
+                editor.restore_observations(*back)
+                self.send_changes(-1, done=False)
 
     def use_camera(self, message: UseCamera) -> None:
         """Go on with another camera, and send the map that was adjusted to it."""
@@ -190,6 +199,19 @@ class MapServer:
             self._send(StateSaved(number, path))
         give_back_memory()  # of the state, and of what the graph has changed since
 
+    def answer(self, message: TellObjects | SaveMap) -> None:
+        """Send the objects of the largest segment, or write the map for other runs."""
+        world, failure = self.system.mapper.world, ""
+        if isinstance(message, TellObjects):
+            keyframes = world.in_segment(world.largest_segment())
+            self._send(ObjectsTold(self.system.semantics.map_objects(keyframes)))
+            return
+        try:
+            self.system.save_map(message.path)
+        except (InputError, OSError) as error:
+            failure = str(error)
+        self._send(MapSaved(message.path, failure))
+
     def _write(self, path: Path) -> None:
         header = {"camera": asdict(self.system.camera)}
         write_arrays(path, STATE_FILE, header, self.system.state())
@@ -204,10 +226,8 @@ class MapServer:
         self._count_visibility(message.visibility)
         system.mapper.history.extend(message.history)
         tracked, segment = self._updated(message)
-        nothing = np.zeros((0, 0), np.float32)
-        frame = Frame(
-            message.frame_index, message.timestamp_s, np.zeros((0, 0, 3), np.uint8), nothing
-        )
+        no_images = np.zeros((0, 0, 3), np.uint8), np.zeros((0, 0), np.float32)
+        frame = Frame(message.frame_index, message.timestamp_s, *no_images)
         system.camera_tracker.segment = segment
         system.events.begin_frame(frame.index, frame.timestamp_s)
         _, keyframe = system.insert(frame, tracked, message.local_ids)

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from bmask_slam.dense.keyframe_input import KeyframeSnapshot
+from bmask_slam.graph.arrays import Floats
 from bmask_slam.live.messages import Masks
 from bmask_slam.live.processes.dense_messages import (
     Accepted,
@@ -62,6 +63,8 @@ class RemoteDenseMapper:
     Attributes:
         submaps: ids of keyframes that have a submap.
         previews: of finished submaps, which the viewer removes from here.
+        keeps_previews: whether there is a viewer.
+        listeners: called with the keyframe's id and the points of each preview.
         skipped: keyframes of the map that will get no submap, and why.
         dropped: how many of those were dropped because newer ones came.
         unwritten: how many could not be written because the disk was full.
@@ -72,7 +75,9 @@ class RemoteDenseMapper:
         """Start the process; call ``wait_until_ready`` before the first keyframe."""
         self.submaps: set[int] = set()
         self.previews: dict[int, Preview] = {}
+        self.listeners: list[Callable[[int, Floats], None]] = []
         self.skipped: dict[int, str] = {}
+        self.keeps_previews = True
         self.dropped = self.unwritten = 0
         self._waiting: dict[int, _Waiting] = {}
         self._sent: dict[int, KeyframeToMap] = {}
@@ -194,8 +199,7 @@ class RemoteDenseMapper:
                 case Mapped():
                     if self._sent.pop(message.keyframe_id, None) is not None:
                         self.submaps.add(message.keyframe_id)
-                        if message.preview is not None:
-                            self.previews[message.keyframe_id] = message.preview
+                        self._keep(message)
                 case NotMapped():
                     self.unwritten += message.disk_full
                     self._sent.pop(message.keyframe_id, None)
@@ -208,6 +212,14 @@ class RemoteDenseMapper:
             for number in [*self._waiting, *self._sent]:
                 self._skip(number, "dense mapping was given up")
             self._sent, self._to_resend, self._working = {}, [], None
+
+    def _keep(self, message: Mapped) -> None:
+        """Keep a submap's preview for the viewer, and tell the listeners."""
+        if message.preview is not None:
+            if self.keeps_previews:
+                self.previews[message.keyframe_id] = message.preview
+            for listener in self.listeners:
+                listener(message.keyframe_id, message.preview.points)
 
     def _send_new(self, number: int, world: WorldMap) -> None:
         """Send a keyframe with its present pose and landmarks."""

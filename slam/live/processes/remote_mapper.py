@@ -16,17 +16,21 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.sensors.streams import Measurements
+from bmask_slam.labelling.results import MapObjects
 from bmask_slam.labelling.semantic_mapper import kept_depth
 from bmask_slam.live.messages import (
     AddMeasurements,
     Finish,
     LostKeyframe,
     MapChanged,
+    MapSaved,
     NewKeyframe,
+    ObjectsTold,
     PruneLandmarks,
     PruneMask,
     RestoreObservations,
     SaveState,
+    TellObjects,
     VisibilityCounts,
 )
 from bmask_slam.live.processes.map_worker import MapWorker
@@ -41,8 +45,8 @@ from bmask_slam.world.appearance import Patches
 from bmask_slam.world.frame_history import NO_KEYFRAME, Entries, FrameHistory
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
-SAVE_EVERY = 20
-"""Interval of saved states in keyframes."""
+SAVE_EVERY, SAVE_SHARE = 20, 0.05  # a state is the whole map
+"""Least interval of saved states in keyframes, and as a share of those of the map."""
 MAX_PENDING = 3
 """Largest number of keyframes that wait for the process; then no further one is accepted."""
 
@@ -60,6 +64,9 @@ class RemoteMapper:
         changes: how often the copy was updated.
         reference: the keyframe that tracking refers to; set before ``insert``.
         worker: the process that owns the map.
+        objects: as the process told them last; None before.
+        maps_saved: answers to ``SaveMap``, which their reader removes.
+        extends: whether keyframes are made; else frames are only located in the map.
     """
 
     def __init__(
@@ -74,8 +81,10 @@ class RemoteMapper:
         self.changes = 0
         self.reference: Keyframe | None = None
         self._folder, self._has_labels = folder, len(names) > 1
-        self._sent_frames = 0
-        self._saved_keyframes = 0
+        self.objects: MapObjects | None = None
+        self.maps_saved: list[MapSaved] = []
+        self.extends, self._asked = True, False
+        self._sent_frames = self._saved_keyframes = 0
         self._pending: set[int] = set()
         self.worker = MapWorker((camera, config, names), self._replacement)
 
@@ -96,7 +105,7 @@ class RemoteMapper:
     @property
     def accepts_keyframes(self) -> bool:
         """Whether a keyframe will be worked on soon: not while too many wait."""
-        return self.pending < MAX_PENDING and not self.given_up
+        return self.extends and self.pending < MAX_PENDING and not self.given_up
 
     @property
     def given_up(self) -> bool:
@@ -160,6 +169,12 @@ class RemoteMapper:
         """Send a message, which is sent again to a new process if this one dies."""
         self.worker.send(message)
 
+    def ask_for_objects(self) -> None:
+        """Let the process send its objects, unless it is asked already."""
+        if not self._asked and not self.given_up:
+            self._asked = True
+            self.send(TellObjects())
+
     def save_state(self) -> None:
         """Let the process save its state, from which it can be started again."""
         self.send(SaveState(self._folder / ".live-state"))
@@ -189,6 +204,10 @@ class RemoteMapper:
                     self._apply(message)
                 case Event():
                     self.events.receive(message)
+                case ObjectsTold():
+                    self.objects, self._asked = message.objects, False
+                case MapSaved():
+                    self.maps_saved.append(message)
                 case _:
                     others.append(message)
         return others
@@ -238,26 +257,26 @@ class RemoteMapper:
             return None
         parent_id, T_parent_lost = _parent(message)
         self.history.hand_over(message.id, parent_id, T_parent_lost)
-        known = len(self.world.landmarks)
-        return LostKeyframe(message.id, parent_id, T_parent_lost, message.history, known)
+        parent = message.id, parent_id, T_parent_lost
+        return LostKeyframe(*parent, message.history, len(self.world.landmarks))
 
     def _apply(self, message: MapChanged) -> None:
         apply_delta(message.delta, self.world, self.history)
-        known_ids = set(self.places.keyframe_ids)
-        for keyframe_id in known_ids - self.world.keyframes.keys():
+        known_ids, present = set(self.places.keyframe_ids), self.world.keyframes
+        for keyframe_id in known_ids - present.keys():
             self.places.remove(keyframe_id)
-        for keyframe_id in sorted(self.world.keyframes.keys() - known_ids):
-            self.places.add(keyframe_id, self.world.keyframes[keyframe_id].features.descriptors)
+        for keyframe_id in sorted(present.keys() - known_ids):
+            self.places.add(keyframe_id, present[keyframe_id].features.descriptors)
         self.changes += 1
-        self.loops_closed = message.loops_closed
-        self.sensors.newest = message.newest
+        self.loops_closed, self.sensors.newest = message.loops_closed, message.newest
         if not message.done:
             return
         self.update_ms.append(message.update_ms)
         self.world.release_memory()
         self._pending -= set(message.delta.keyframe_ids.tolist()) | {message.keyframe_id}
-        if message.keyframe_id + 1 - self._saved_keyframes >= SAVE_EVERY:
-            self._saved_keyframes = message.keyframe_id + 1
+        made = message.keyframe_id + 1
+        if made - self._saved_keyframes >= max(SAVE_EVERY, SAVE_SHARE * len(present)):
+            self._saved_keyframes = made
             self.save_state()
 
     def _visibility_counts(self) -> VisibilityCounts:

@@ -13,6 +13,10 @@ from bmask_slam.live.processes.worker import Failure, Worker
 
 logger = logging.getLogger(__name__)
 
+LEAST_SHARE, SLOWEST = 0.01, 10.0
+"""A process that works gets at least this share of a processor on a busy machine, where it may
+take so many times as long."""
+
 
 @dataclass(frozen=True)
 class RestartPolicy:
@@ -20,7 +24,8 @@ class RestartPolicy:
 
     Attributes:
         start_s: longest time of its start; a busy machine needs minutes to load a network.
-        answer_s: longest time without a message while it works.
+        answer_s: longest time without a message while it works, if it takes so much of the
+            processor's time or none; one that a busy machine lets run slowly has ten times that.
         restarts: largest number of restarts.
     """
 
@@ -52,7 +57,7 @@ class SupervisedWorker:
         self.name = name
         self.crashes = 0
         self._target, self.arguments, self._policy = target, arguments, policy
-        self._heard_s = time.monotonic()
+        self._heard_s, self._used_s = time.monotonic(), 0.0
         self._is_ready = False
         self._worker = self._start()
 
@@ -82,7 +87,7 @@ class SupervisedWorker:
                         return message
                     case Failure():
                         self.close()
-                        raise InputError(message.text.strip().splitlines()[-1])
+                        raise InputError(message.reason)
             if not is_running:
                 self.close()
                 raise InputError(f"the {self.name}'s process did not start; see the lines above")
@@ -93,14 +98,14 @@ class SupervisedWorker:
     def send(self, message: Any, begins: bool = False) -> None:
         """Send a message; one that ``begins`` work starts the time in which it must answer."""
         if begins:
-            self._heard_s = time.monotonic()
+            self._now_heard()
         self._worker.send(message)
 
     def receive(self) -> list[Any]:
         """The messages received, without failures, which are logged, and ``Ready``."""
         messages = self._worker.receive()
         if messages:
-            self._heard_s = time.monotonic()
+            self._now_heard()
             self._is_ready = True
         for message in messages:
             if isinstance(message, Failure):
@@ -113,10 +118,11 @@ class SupervisedWorker:
             return False
         silent_s = time.monotonic() - self._heard_s
         limit_s = self._policy.answer_s if self._is_ready else self._policy.start_s
-        if self._worker.is_running and not (busy and silent_s > limit_s):
+        hangs = busy and silent_s > limit_s and not self._is_slow(silent_s, limit_s)
+        if self._worker.is_running and not hangs:
             return False
         self.crashes += 1
-        self._heard_s, self._is_ready = time.monotonic(), False
+        self._heard_s, self._used_s, self._is_ready = time.monotonic(), 0.0, False
         self._worker.kill()
         if self.given_up:
             logger.error("the %s died %d times; it is not restarted", self.name, self.crashes)
@@ -128,6 +134,14 @@ class SupervisedWorker:
     def close(self) -> None:
         """End the process at once."""
         self._worker.kill()
+
+    def _is_slow(self, silent_s: float, limit_s: float) -> bool:
+        """Whether it works, but the machine is too busy for it to have been done by now."""
+        used_s = self._worker.processor_s - self._used_s
+        return silent_s < SLOWEST * limit_s and LEAST_SHARE * silent_s < used_s < limit_s
+
+    def _now_heard(self) -> None:
+        self._heard_s, self._used_s = time.monotonic(), self._worker.processor_s
 
     def _start(self) -> Worker:
         return Worker(self.name, self._target, *self.arguments)

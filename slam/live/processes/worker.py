@@ -21,9 +21,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from bmask_slam.graph.errors import InputError
 from bmask_slam.live.channel import Channel, ForwardedLog
 from bmask_slam.live.shared_memory import SIZE, Ring, anonymous_file
 from bmask_slam.runtime.stop_request import SIGNALS
@@ -40,9 +42,13 @@ OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 
 @dataclass(frozen=True)
 class Failure:
-    """The last message of a worker that raised an exception: the traceback."""
+    """The last message of a worker that raised an exception: the traceback, and its last line.
+
+    The ``reason`` of an InputError is its own text, without the exception's name.
+    """
 
     text: str
+    reason: str = ""
 
 
 class Worker:
@@ -79,6 +85,15 @@ class Worker:
     def pid(self) -> int:
         """Process id."""
         return self._process.pid
+
+    @property
+    def processor_s(self) -> float:
+        """The processor's time that it has used; 0 where the system does not say."""
+        try:
+            words = Path(f"/proc/{self.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        except OSError:
+            return 0.0
+        return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
     @property
     def is_running(self) -> bool:
@@ -147,7 +162,9 @@ def serve(connection: int, child_socket: int, parent_end: int) -> None:
     def send_failure(
         kind: type[BaseException], error: BaseException, where: TracebackType | None
     ) -> None:
-        channel.send(Failure("".join(traceback.format_exception(kind, error, where))))
+        last = traceback.format_exception_only(kind, error)[-1].strip()
+        reason = str(error) if isinstance(error, InputError) else last
+        channel.send(Failure("".join(traceback.format_exception(kind, error, where)), reason))
         channel.finish()
 
     sys.excepthook = send_failure

@@ -20,13 +20,26 @@ HEADER_BYTES = 4
 _SOURCE = "ros2:"
 _BROKEN = (ValueError, AssertionError, LookupError, TypeError, struct.error, MemoryError)
 _IDL_NAMES = {"bool": "boolean", "byte": "uint8", "char": "uint8", "octet": "uint8"}
+MORE_TYPES = {
+    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score",
+    "vision_msgs/msg/ObjectHypothesisWithPose":
+        "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
+    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+    "vision_msgs/msg/Detection3D":
+        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\nstring id",
+    "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nDetection3D[] detections",
+}  # fmt: skip
+"""Fields of messages that rosbags does not have, as of vision_msgs 4 (Humble and later)."""
 
 
 @cache
 def typestore() -> Any:
-    """The definitions of ROS 2 Humble's messages, which later ROS 2 shares."""
+    """The definitions of ROS 2 Humble's messages, which later ROS 2 shares, and of MORE_TYPES."""
     typesys = import_extra("rosbags.typesys", _SOURCE, "ros2")
-    return typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    for name, text in MORE_TYPES.items():
+        store.register(typesys.get_types_from_msg(text, name))
+    return store
 
 
 def dds_name(name: str) -> str:
@@ -98,6 +111,15 @@ def carried_type(name: str) -> Any:
     return made
 
 
+def decoded(data: bytes, name: str) -> Any | None:
+    """The message of received bytes, None for bytes that are none of its type."""
+    broken = import_extra("rosbags.serde", _SOURCE, "ros2").SerdeError
+    try:
+        return typestore().deserialize_cdr(data, name)
+    except (broken, *_BROKEN):
+        return None
+
+
 class Quality(NamedTuple):
     """Quality of service of a topic.
 
@@ -146,10 +168,11 @@ class Reader:
             data = getattr(sample, "cdr", b"")
             if len(data) <= HEADER_BYTES:
                 continue  # a publisher has gone
-            try:
-                yield typestore().deserialize_cdr(data, self._name)
-            except _BROKEN:
+            message = decoded(data, self._name)
+            if message is None:
                 self.broken += 1
+            else:
+                yield message
 
 
 class Node:

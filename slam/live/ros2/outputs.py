@@ -2,43 +2,34 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Bytes
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import (
-    adjoint,
-    inverse,
-    make_pose,
-    orthonormalised,
-    quaternion_from_rotation,
+from bmask_slam.graph.geometry import inverse, make_pose, orthonormalised
+from bmask_slam.labelling.results import MapObjects
+from bmask_slam.live.ros2.dds import LATCHED, STATE, Node
+from bmask_slam.live.ros2.messages import (
+    header,
+    message,
+    occupancy_grid,
+    point_cloud,
+    pose,
+    ros_covariance,
+    transform,
+    type_name,
 )
-from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.labelling.results import LandmarkCloud
-from bmask_slam.live.ros2.dds import LATCHED, STATE, Node, typestore
+from bmask_slam.live.ros2.objects import detection_array, marker_array
+from bmask_slam.mapping.products.occupancy import OccupancyGrid
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 OPTICAL = make_pose(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
 """T_base_camera of a camera that looks along the base's x, where nothing else is said (REP 103)."""
-UNKNOWN_VARIANCE = 1e6
-PERIOD_S = 1.0
-"""Between two messages with the map and the health."""
-MAX_POSES, MAX_POINTS = 1000, 20_000
-"""Of the path, and of landmarks, those seen most often, in a message."""
 DIAGNOSTIC_LEVELS = {"OK": 0, "WEAK": 1, "DEAD_RECKONING": 1, "LOST": 2}
-PACKAGES = {
-    **dict.fromkeys(("Time",), "builtin_interfaces"),
-    **dict.fromkeys(("Header",), "std_msgs"),
-    **dict.fromkeys(("Odometry", "Path"), "nav_msgs"),
-    **dict.fromkeys(("PointCloud2", "PointField"), "sensor_msgs"),
-    **dict.fromkeys(("DiagnosticArray", "DiagnosticStatus", "KeyValue"), "diagnostic_msgs"),
-    **dict.fromkeys(("TFMessage",), "tf2_msgs"),
-}
-"""Of message types; the others are of geometry_msgs."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +37,17 @@ class Ros2Frames:
     """Names of frames, and where the camera is on the robot.
 
     Attributes:
-        map, odom, base, camera: tf's frames. ``odom`` is ``map``: corrections of the graph move
-            the base.
+        map, odom, base, camera: tf's frames. Without wheel odometry ``odom`` is ``map``, and
+            corrections of the graph move the base.
         base_camera: T_base_camera as 16 numbers by rows; the base's x is forward, its z up. Empty:
-            a level camera that looks along x.
+            that of /tf_static, or a level camera that looks along x.
         prefix: of the topics.
+        tf_ahead_s: with wheel odometry, the transform from ``map`` to ``odom`` is stamped so much
+            later than the image, so that it holds until the next one (as nav2's AMCL does).
+        floor_m: height of the floor in the base's frame, for the grid. Where the camera's place
+            is not known, the floor is the lowest level with many points.
+        grid_resolution_m: edge of the grid's cells.
+        grid_low_m, grid_high_m: what is lower above the floor is driven over, higher under.
     """
 
     map: str = "map"
@@ -59,6 +56,11 @@ class Ros2Frames:
     camera: str = "camera_optical_frame"
     base_camera: tuple[float, ...] = ()
     prefix: str = "/bmask_slam"
+    tf_ahead_s: float = 0.1
+    floor_m: float = 0.0
+    grid_resolution_m: float = 0.05
+    grid_low_m: float = 0.1
+    grid_high_m: float = 1.5
 
     def __post_init__(self) -> None:
         if self.base_camera:
@@ -69,68 +71,32 @@ class Ros2Frames:
                 raise InputError("base_camera: must be the 16 numbers of a pose T_base_camera")
 
     @property
-    def T_base_camera(self) -> Array:
-        """(4, 4)."""
+    def T_base_camera(self) -> Array | None:
+        """(4, 4); None where it is not given."""
         if not self.base_camera:
-            return OPTICAL
+            return None
         return orthonormalised(np.array(self.base_camera, float).reshape(4, 4))
 
 
-def type_name(last: str) -> str:
-    """The full name of a message type, such as nav_msgs/msg/Path."""
-    return f"{PACKAGES.get(last, 'geometry_msgs')}/msg/{last}"
+@dataclass(frozen=True)
+class Robot:
+    """What is known of the robot.
 
-
-def message(last: str, *values: Any) -> Any:
-    """A message of a type by the last part of its name, with its fields in order."""
-    return typestore().types[type_name(last)](*values)
-
-
-def header(stamp_s: float, frame: str) -> Any:
-    """A std_msgs/Header."""
-    seconds, nanoseconds = divmod(round(stamp_s * 1e9), 1_000_000_000)
-    return message("Header", message("Time", seconds, nanoseconds), frame)
-
-
-def pose(T: Array) -> Any:
-    """A geometry_msgs/Pose."""
-    x, y, z, w = map(float, quaternion_from_rotation(T[:3, :3]))
-    return message(
-        "Pose", message("Point", *map(float, T[:3, 3])), message("Quaternion", x, y, z, w)
-    )
-
-
-def transform(stamp_s: float, frames: tuple[str, str], T: Array) -> Any:
-    """A geometry_msgs/TransformStamped of T_parent_child."""
-    x, y, z, w = map(float, quaternion_from_rotation(T[:3, :3]))
-    moved = message("Vector3", *map(float, T[:3, 3]))
-    both = message("Transform", moved, message("Quaternion", x, y, z, w))
-    return message("TransformStamped", header(stamp_s, frames[0]), frames[1], both)
-
-
-def ros_covariance(covariance: Array | None, T_base_camera: Array, T_map_base: Array) -> Array:
-    """ROS's covariance (6, 6) of the base's pose: x y z and turns about the map's fixed axes.
-
-    From that of the tangent [rotation, translation] at the camera, by ``Ad(T_base_camera)`` and the
-    base's rotation in the map; large where it is not known.
+    Attributes:
+        T_base_camera: (4, 4).
+        is_known: it is that of the robot, no assumption.
+        by_tf: somebody else publishes the camera's place.
+        T_odom_base: gives the pose (4, 4) of the base by wheel odometry at a time, None where that
+            does not cover it. None: there is no wheel odometry. Who measures it publishes the
+            transform from ``odom`` to ``base``, as drivers of robots do.
+        ros_time: ROS's stamp of a frame's time.
     """
-    if covariance is None or not np.isfinite(covariance).all():
-        return np.eye(6) * UNKNOWN_VARIANCE
-    R, Ad = T_map_base[:3, :3], adjoint(T_base_camera)
-    J = np.vstack([R @ Ad[3:], R @ Ad[:3]])
-    return np.asarray(J @ covariance @ J.T)
 
-
-def point_cloud(stamp_s: float, frame: str, points: Array, colours: Bytes) -> Any:
-    """A sensor_msgs/PointCloud2 of points (N, 3) with colours (N, 3): x y z rgb, 16 bytes each."""
-    rows = np.zeros(len(points), [("xyz", "<f4", 3), ("bgr", "u1", 3), ("pad", "u1")])
-    rows["xyz"], rows["bgr"] = points, colours[:, ::-1]
-    fields = [message("PointField", n, 4 * k, 7, 1) for k, n in enumerate(("x", "y", "z", "rgb"))]
-    data = np.frombuffer(rows.tobytes(), np.uint8)
-    size = 16 * len(points)
-    return message(
-        "PointCloud2", header(stamp_s, frame), 1, len(points), fields, False, 16, size, data, True
-    )
+    T_base_camera: Array
+    is_known: bool = False
+    by_tf: bool = False
+    T_odom_base: Callable[[float], Array | None] | None = None
+    ros_time: Callable[[float], float] = float
 
 
 class Ros2Outputs:
@@ -139,10 +105,11 @@ class Ros2Outputs:
     The map's frame is the base's at the first keyframe: z up if the robot stood level.
     """
 
-    def __init__(self, node: Node, frames: Ros2Frames) -> None:
-        self._frames = frames
-        self._T_map_world = frames.T_base_camera
-        self._T_camera_base = inverse(frames.T_base_camera)
+    def __init__(self, node: Node, frames: Ros2Frames, robot: Robot) -> None:
+        self._frames, self._robot = frames, robot
+        self._T_map_world = robot.T_base_camera
+        self._T_camera_base = inverse(robot.T_base_camera)
+        self._T_map_odom: Array | None = None
         prefix = frames.prefix
 
         def writer(topic: str, last: str, quality: Any = STATE) -> Any:
@@ -152,30 +119,53 @@ class Ros2Outputs:
         self._pose = writer(f"{prefix}/pose", "PoseWithCovarianceStamped")
         self._path = writer(f"{prefix}/path", "Path", LATCHED)
         self._landmarks = writer(f"{prefix}/landmarks", "PointCloud2", LATCHED)
+        self._grid = writer(f"{prefix}/map", "OccupancyGrid", LATCHED)
+        self._markers = writer(f"{prefix}/object_markers", "MarkerArray", LATCHED)
+        self._detections = writer(f"{prefix}/objects", "Detection3DArray", LATCHED)
         self._diagnostics = writer("/diagnostics", "DiagnosticArray")
         self._tf = writer("/tf", "TFMessage")
         self._tf_static = writer("/tf_static", "TFMessage", LATCHED)
-        links = (
-            ((frames.map, frames.odom), np.eye(4)),
-            ((frames.base, frames.camera), frames.T_base_camera),
-        )
-        static = [transform(0.0, names, T) for names, T in links]
-        self._tf_static.send(message("TFMessage", static))
+        static = []
+        if robot.T_odom_base is None:
+            static.append(transform(0.0, (frames.map, frames.odom), np.eye(4)))
+        if not robot.by_tf:
+            static.append(transform(0.0, (frames.base, frames.camera), robot.T_base_camera))
+        if static:
+            self._tf_static.send(message("TFMessage", static))
 
-    def frame(self, result: FrameResult) -> None:
-        """Publish a frame's pose; one that is lost has none."""
-        if result.T_world_camera is None or result.status is TrackingStatus.LOST:
+    def frame(self, result: FrameResult, known: bool = True) -> None:
+        """Publish a frame's pose; one that is lost has none, and leaves ``odom`` where it was.
+
+        ``known``: its map is the one that is published.
+        """
+        f, stamp_s = self._frames, self._robot.ros_time(result.timestamp_s)
+        lost = result.status is TrackingStatus.LOST or not known
+        if result.T_world_camera is None or lost:
+            self._send_map_odom(stamp_s)
             return
-        f, stamp_s = self._frames, result.timestamp_s
         T_map_base = self._T_map_world @ result.T_world_camera @ self._T_camera_base
-        covariance = ros_covariance(result.covariance, f.T_base_camera, T_map_base).ravel()
-        known = message("PoseWithCovariance", pose(T_map_base), covariance)
+        covariance = ros_covariance(result.covariance, self._robot.T_base_camera, T_map_base)
+        where = message("PoseWithCovariance", pose(T_map_base), covariance.ravel())
         zero = message("Vector3", 0.0, 0.0, 0.0)
         twist = message("TwistWithCovariance", message("Twist", zero, zero), np.full(36, -1.0))
-        self._odometry.send(message("Odometry", header(stamp_s, f.odom), f.base, known, twist))
-        self._pose.send(message("PoseWithCovarianceStamped", header(stamp_s, f.map), known))
-        moved = transform(stamp_s, (f.odom, f.base), T_map_base)
-        self._tf.send(message("TFMessage", [moved]))
+        frame = f.odom if self._robot.T_odom_base is None else f.map
+        self._odometry.send(message("Odometry", header(stamp_s, frame), f.base, where, twist))
+        self._pose.send(message("PoseWithCovarianceStamped", header(stamp_s, f.map), where))
+        if self._robot.T_odom_base is None:
+            moved = transform(stamp_s, (f.odom, f.base), T_map_base)
+            self._tf.send(message("TFMessage", [moved]))
+            return
+        T_odom_base = self._robot.T_odom_base(result.timestamp_s)
+        if T_odom_base is not None:
+            self._T_map_odom = T_map_base @ inverse(T_odom_base)
+        self._send_map_odom(stamp_s)
+
+    def _send_map_odom(self, stamp_s: float) -> None:
+        """Publish where odometry's frame is in the map, once it is known."""
+        if self._T_map_odom is not None:
+            frames, ahead_s = (self._frames.map, self._frames.odom), self._frames.tf_ahead_s
+            moved = transform(stamp_s + ahead_s, frames, self._T_map_odom)
+            self._tf.send(message("TFMessage", [moved]))
 
     def map(self, stamp_s: float, path_world: Array, points_world: Array, colours: Bytes) -> None:
         """Publish keyframe poses (K, 4, 4) and landmarks (N, 3) with colours (N, 3)."""
@@ -185,6 +175,16 @@ class Ros2Outputs:
         R, t = self._T_map_world[:3, :3], self._T_map_world[:3, 3]
         self._landmarks.send(point_cloud(stamp_s, f.map, points_world @ R.T + t, colours))
 
+    def objects(self, stamp_s: float, found: MapObjects) -> None:
+        """Publish objects as markers and as detections."""
+        where = stamp_s, self._frames.map, found, self._T_map_world
+        self._markers.send(marker_array(*where))
+        self._detections.send(detection_array(*where))
+
+    def grid(self, stamp_s: float, grid: OccupancyGrid, floor_m: float) -> None:
+        """Publish the map to drive on; ``floor_m`` is the floor's height in the map's frame."""
+        self._grid.send(occupancy_grid(stamp_s, self._frames.map, grid, floor_m))
+
     def health(self, stamp_s: float, values: dict[str, Any]) -> None:
         """Publish numbers and texts by name; ``status`` gives the level."""
         status = str(values.get("status", ""))
@@ -192,34 +192,3 @@ class Ros2Outputs:
         level = DIAGNOSTIC_LEVELS.get(status, 2)
         told = message("DiagnosticStatus", level, "bmask_slam: tracking", status, "", rows)
         self._diagnostics.send(message("DiagnosticArray", header(stamp_s, ""), [told]))
-
-
-class LiveRun(Protocol):
-    """What ``Ros2Publisher`` asks of a live run; `LiveSlam` has it."""
-
-    def map(self) -> LandmarkCloud: ...
-    def trajectory(self) -> Trajectory: ...
-    def health(self) -> Any: ...
-
-
-class Ros2Publisher:
-    """Called with the result of each frame; publishes it, and the map and health each second."""
-
-    def __init__(self, node: Node, frames: Ros2Frames) -> None:
-        self._outputs = Ros2Outputs(node, frames)
-        self._due_s = 0.0
-
-    def __call__(self, result: FrameResult, run: LiveRun) -> None:
-        """Publish a result, and the map where a second has passed."""
-        self._outputs.frame(result)
-        if time.monotonic() < self._due_s:
-            return
-        self._due_s = time.monotonic() + PERIOD_S
-        cloud, path = run.map(), run.trajectory().poses_world_camera
-        path = path[:: len(path) // MAX_POSES + 1]
-        best = np.argsort(-cloud.observations, kind="stable")[:MAX_POINTS]
-        points, colours = cloud.points_world[best], cloud.colours[best]
-        self._outputs.map(result.timestamp_s, path, points, colours)
-        health = asdict(run.health())
-        counts = health.pop("source")
-        self._outputs.health(result.timestamp_s, health | counts)

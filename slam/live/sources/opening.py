@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from bmask_slam.graph.errors import InputError
@@ -11,10 +11,11 @@ from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
 from bmask_slam.live.sources.opencv_camera import OpenCvSource
 from bmask_slam.live.sources.realsense_camera import RealSenseSource
-from bmask_slam.live.sources.ros2_source import Ros2Source
+from bmask_slam.live.sources.ros2_source import Ros2Options, Ros2Source
 from bmask_slam.live.sources.source import Limited, RecordedSource, Source
 from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.bags.bag_file import is_bag
+from bmask_slam.sequences.bags.sensors import SensorTopics
 from bmask_slam.sequences.bags.topics import BagTopics
 from bmask_slam.sequences.formats.layouts import is_recording_file
 
@@ -33,6 +34,7 @@ class SourceOptions:
         silence_s: such a folder, or a camera, has ended when nothing new comes for so long.
         topics: of a bag, or of ROS 2.
         reliable: ROS 2 sends images again that are lost.
+        sensors: topics of ROS 2.
     """
 
     camera: Path | None = None
@@ -42,6 +44,7 @@ class SourceOptions:
     silence_s: float = 10.0
     topics: BagTopics = field(default_factory=BagTopics)
     reliable: bool = False
+    sensors: SensorTopics = field(default_factory=SensorTopics)
 
 
 def open_source(text: str, options: SourceOptions) -> Source:
@@ -57,9 +60,7 @@ def open_source(text: str, options: SourceOptions) -> Source:
     elif text.startswith(OPENCV):
         source = OpenCvSource(_device(text), options.camera, options.silence_s)
     elif text.startswith(ROS2):
-        domain = _domain(text)
-        silence_s, reliable = options.silence_s, options.reliable
-        source = Ros2Source(domain, options.topics, options.camera, silence_s, reliable)
+        source = Ros2Source(_domain(text), _of_ros2(options))
     elif is_bag(path):
         source = BagSource(path, options.topics, options.camera, options.realtime)
     elif options.follow:
@@ -74,6 +75,17 @@ def open_source(text: str, options: SourceOptions) -> Source:
             "realsense:, opencv:N or ros2:"
         )
     return source if options.max_frames is None else Limited(source, options.max_frames)
+
+
+def ros2_of(source: Source) -> Ros2Source | None:
+    """The source, also of a limited one, if it is ROS 2."""
+    inner = source.source if isinstance(source, Limited) else source
+    return inner if isinstance(inner, Ros2Source) else None
+
+
+def _of_ros2(options: SourceOptions) -> Ros2Options:
+    names = [f.name for f in fields(Ros2Options)]
+    return Ros2Options(**{name: getattr(options, name) for name in names})
 
 
 def _domain(text: str) -> int:

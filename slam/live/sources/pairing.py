@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from bisect import bisect_right
 from collections import deque
 from typing import Generic, NamedTuple, TypeVar
 
@@ -51,6 +52,22 @@ class StreamClock:
         self._epochs = [0, 0]
         self._last_s = [-np.inf, -np.inf]
         self._latest_s = -np.inf
+        self._begins_s = [-np.inf]
+
+    @property
+    def latest_s(self) -> float:
+        """The latest mapped stamp."""
+        return self._latest_s
+
+    @property
+    def shift_s(self) -> float:
+        """What is added to stamps at present."""
+        return self._shifts_s[-1]
+
+    def original(self, placed_s: float) -> float:
+        """The stamp that was mapped to ``placed_s``."""
+        epoch = bisect_right(self._begins_s, placed_s) - 1
+        return placed_s - self._shifts_s[epoch]
 
     def map_stamp(self, stream: int, stamp_s: float) -> float | None:
         """The mapped stamp in seconds; None for a duplicate or late one, which is counted."""
@@ -73,6 +90,7 @@ class StreamClock:
         if self._epochs[stream] < len(self._shifts_s):
             return
         self._counts.clock_jumps += 1
+        self._begins_s.append(self._latest_s + LATE_S / 2)
         self._shifts_s.append(self._latest_s + LATE_S - stamp_s)
         logger.warning(
             "the clock was set back by %.3f s; stamps are shifted by %.3f s from here on",
@@ -106,6 +124,9 @@ class Pairer(Generic[T]):
     stamps are equal, else with the next image of the stream with the earlier stamp. The pairs are
     those of ``associate_stamps`` over all stamps, unless the streams step by less than
     ``max_difference_s``.
+
+    Attributes:
+        clock: of both streams.
     """
 
     def __init__(
@@ -117,13 +138,13 @@ class Pairer(Generic[T]):
     ) -> None:
         self._counts, self._max_s, self._max_waiting = counts, max_difference_s, max_waiting
         self._offsets_s = (0.0, depth_offset_s)
-        self._clock, self._gaps = StreamClock(counts), GapMeter(counts)
+        self.clock, self._gaps = StreamClock(counts), GapMeter(counts)
         self._waiting: tuple[deque[tuple[float, T]], ...] = (deque(), deque())
         self._heard_s = [-np.inf, -np.inf]
 
     def add(self, stream: int, stamp_s: float, item: T) -> list[Pair[T]]:
         """Add an image of a stream, RGB or DEPTH; returns the pairs that are final by it."""
-        placed_s = self._clock.map_stamp(stream, stamp_s)
+        placed_s = self.clock.map_stamp(stream, stamp_s)
         if placed_s is None:
             return []
         placed_s += self._offsets_s[stream]

@@ -5,23 +5,34 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
+
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import inverse
+from bmask_slam.graph.sensors.config import SensorsConfig
+from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.ros2.dds import LATCHED, SENSOR, STATE, Node, Reader
+from bmask_slam.live.ros2.sensors import ImageClock, Ros2Sensors, mounted
 from bmask_slam.live.sources.message_frames import message_frames
 from bmask_slam.live.sources.pairing import DEPTH, RGB, Pair, Pairer
 from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
-from bmask_slam.sequences.bags.bag_file import INFO_TYPE, Topic
+from bmask_slam.sequences.bags.bag_file import INFO_TYPE, Bag, Topic
 from bmask_slam.sequences.bags.ros_images import stamp_s
+from bmask_slam.sequences.bags.sensors import SensorTopics
 from bmask_slam.sequences.bags.topics import (
     TRANSFORMS,
     BagTopics,
     find_camera,
     find_topics,
+    first_message,
+    static_extrinsics,
 )
 from bmask_slam.sequences.frame import Frame
 
@@ -30,6 +41,8 @@ logger = logging.getLogger(__name__)
 POLL_S = 0.002
 EXPECTED_S = 2.0
 """Time in which a topic that has a publisher gives a message, before the camera is known."""
+SENSORS_S = 0.1
+"""Longest time that measurements wait for an image to be handed on with."""
 
 
 class _Heard:
@@ -38,7 +51,7 @@ class _Heard:
     def __init__(self, node: Node, name: str) -> None:
         self.path = Path(name)
         self._node = node
-        self._readers: dict[str, Reader] = {}
+        self._readers: dict[str, list[Reader]] = {}
         self._messages: dict[str, list[Any]] = {}
 
     @property
@@ -53,16 +66,45 @@ class _Heard:
             if name in kinds:
                 yield from ((name, message) for message in self._received(name, kinds[name]))
 
+    def keep(self, name: str) -> None:
+        """Receive only one topic from now on."""
+        self._readers = {n: readers for n, readers in self._readers.items() if n == name}
+
     def _received(self, name: str, kind: str) -> list[Any]:
         if name not in self._readers:
-            quality = LATCHED._replace(depth=100) if name == TRANSFORMS else SENSOR
-            self._readers[name] = self._node.reader(name, kind, quality)
+            quality = LATCHED._replace(depth=100)
+            both = {TRANSFORMS: (quality,), INFO_TYPE: (SENSOR, quality)}  # some send it once
+            chosen = both.get(name) or both.get(kind, (SENSOR,))
+            self._readers[name] = [self._node.reader(name, kind, q) for q in chosen]
         kept = self._messages.setdefault(name, [])
+        kept += self._taken(name) if name == TRANSFORMS else ()
         end_s = time.monotonic() + EXPECTED_S
         while not kept and time.monotonic() < end_s:
-            kept += self._readers[name].take()
+            kept += self._taken(name)
             time.sleep(POLL_S)
         return kept
+
+    def _taken(self, name: str) -> list[Any]:
+        return [message for reader in self._readers[name] for message in reader.take()]
+
+
+@dataclass(frozen=True)
+class Ros2Options:
+    """What is received from ROS 2, and how.
+
+    Attributes:
+        topics: of the images; those that are empty are of a known camera.
+        sensors: topics of the sensors beside the camera.
+        camera: camera file in place of the camera_info.
+        silence_s: how long is waited for publishers, and for frames.
+        reliable: images that are lost are sent again.
+    """
+
+    topics: BagTopics = field(default_factory=BagTopics)
+    sensors: SensorTopics = field(default_factory=SensorTopics)
+    camera: Path | None = None
+    silence_s: float = 10.0
+    reliable: bool = False
 
 
 class Ros2Source(MeasuredSource):
@@ -71,21 +113,17 @@ class Ros2Source(MeasuredSource):
     A publisher may stop and start again; the topics are those of a known camera, or given.
 
     Attributes:
-        counts: images that did not become frames so far.
+        counts: images that did not become frames so far, and measurements that were refused.
         node: the participant, also for what is published.
+        sensors: what is measured beside the camera.
+        deliver: called with measurements, in the thread that iterates over ``frames``, before the
+            frames that came with them.
     """
 
     waits = False
 
-    def __init__(
-        self,
-        domain: int,
-        topics: BagTopics,
-        camera: Path | None,
-        silence_s: float,
-        reliable: bool = False,
-    ) -> None:
-        """Wait until somebody publishes the images and their camera.
+    def __init__(self, domain: int, options: Ros2Options) -> None:
+        """Wait until somebody publishes the images and their camera, and the sensors' topics.
 
         Raises:
             InputError: nobody does for ``silence_s``, or the camera cannot be used.
@@ -94,16 +132,55 @@ class Ros2Source(MeasuredSource):
         self.groundtruth: Trajectory | None = None
         self.counts = SourceCounts()
         self.node = Node(domain)
-        self._silence_s = silence_s
+        self.deliver: Callable[[Measurements], None] = lambda _: None
+        self._silence_s = options.silence_s
         self._closed = threading.Event()
         self._where = f"ros2:{domain}"
-        heard: Any = _Heard(self.node, self._where)
-        self._topics = self._wait_for_topics(heard, topics)
-        self.camera, self._form = find_camera(heard, self._topics, camera)
-        kinds, quality = self.node.published(), STATE if reliable else SENSOR
+        self._heard = _Heard(self.node, self._where)
+        heard = cast("Bag", self._heard)
+        self._topics = self._wait_for_topics(heard, options.topics)
+        self.camera, self._form = find_camera(heard, self._topics, options.camera)
+        self._frame = first_message(heard, self._topics.rgb).header.frame_id.lstrip("/")
+        self._heard.keep(TRANSFORMS)
+        self._pairer = Pairer[Any](self.counts, self.camera.depth_time_offset_s)
+        kinds, quality = self.node.published(), STATE if options.reliable else SENSOR
         names = (self._topics.rgb, self._topics.depth)
         self._readers = [self.node.reader(name, kinds[name], quality) for name in names]
+        self.sensors = Ros2Sensors(self.node, options.sensors, options.silence_s)
+        self._handed_s = 0.0
         logger.info("%s: colour on %s, depth on %s", self._where, *names)
+
+    def mounted(self, config: SensorsConfig) -> SensorsConfig:
+        """The settings, with the mountings of /tf_static where they are left at the default.
+
+        Raises:
+            InputError: a sensor is heard that is not enabled.
+        """
+        for name in self.sensors.names:
+            config.check_enabled(name)
+        return mounted(config, self.sensors.frames(), self.T_camera)
+
+    def T_camera(self, frame: str) -> Array | None:
+        """T_camera_frame (4, 4) of the colour camera by /tf_static; None where it does not say."""
+        if self._frame == frame.lstrip("/"):
+            return np.eye(4)
+        end_s, heard = time.monotonic() + EXPECTED_S, cast("Bag", self._heard)
+        while True:
+            T = static_extrinsics(heard, self._frame, frame)
+            if T is not None or time.monotonic() > end_s:
+                return T
+            if TRANSFORMS not in self.node.published():
+                return None
+            time.sleep(10 * POLL_S)
+
+    def T_base_camera(self, base: str) -> Array | None:
+        """(4, 4) by /tf_static; None where it does not say."""
+        T = self.T_camera(base)
+        return None if T is None else inverse(T)
+
+    def ros_time(self, time_s: float) -> float:
+        """The stamp that an image had, whose clock may have been set back since."""
+        return self._pairer.clock.original(time_s)
 
     def frames(self) -> Iterator[Frame]:
         """A frame of each pair of images.
@@ -119,7 +196,7 @@ class Ros2Source(MeasuredSource):
         self._closed.set()
 
     def _pairs(self) -> Iterator[Pair[Any]]:
-        pairer = Pairer[Any](self.counts, self.camera.depth_time_offset_s)
+        pairer = self._pairer
         heard_s = time.monotonic()
         broken = 0
         while not self._closed.is_set():
@@ -129,6 +206,7 @@ class Ros2Source(MeasuredSource):
                     found += pairer.add(stream, stamp_s(message.header), message)
             self.counts.broken += sum(reader.broken for reader in self._readers) - broken
             broken = sum(reader.broken for reader in self._readers)
+            self._hand_on(bool(found))
             if found:
                 heard_s = time.monotonic()
                 yield from found
@@ -140,6 +218,18 @@ class Ros2Source(MeasuredSource):
             else:
                 self._closed.wait(POLL_S)
         yield from pairer.finish()
+
+    def _hand_on(self, at_once: bool) -> None:
+        """Hand on what was measured: before frames, else from time to time."""
+        now_s, clock = time.monotonic(), self._pairer.clock
+        due = at_once or now_s > self._handed_s + SENSORS_S
+        if not due or not np.isfinite(clock.latest_s):
+            return
+        self._handed_s = now_s
+        for measured in self.sensors.take(ImageClock(clock.latest_s, clock.shift_s)):
+            self.deliver(measured)
+        self.counts.late_measurements = self.sensors.late
+        self.counts.broken_measurements = self.sensors.broken
 
     def _wait_for_topics(self, heard: Any, topics: BagTopics) -> BagTopics:
         """The topics of the images and the camera_info, once they are published."""

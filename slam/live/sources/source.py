@@ -37,6 +37,8 @@ class SourceCounts:
         clock_jumps: how often the clock was set back.
         gaps: steps between frames of more than three times the usual step.
         broken: images or list lines that could not be read.
+        late_measurements, broken_measurements: of sensors beside the camera, from ROS 2: not later
+            than the one before, or of another clock; and what was no measurement.
     """
 
     unpaired_rgb: int = 0
@@ -46,6 +48,8 @@ class SourceCounts:
     clock_jumps: int = 0
     gaps: int = 0
     broken: int = 0
+    late_measurements: int = 0
+    broken_measurements: int = 0
 
     def line(self) -> str:
         """The counts that are not zero, as text; empty if all are zero."""
@@ -138,23 +142,22 @@ class RecordedSource:
 
 
 class Limited:
-    """The first ``max_frames`` frames of another source."""
+    """The first ``max_frames`` frames of another ``source``."""
 
     def __init__(self, source: Source, max_frames: int | None) -> None:
         self.name, self.camera = source.name, source.camera
         self.groundtruth = source.groundtruth
         self.counts, self.waits = source.counts, source.waits
         self.use, self.interpolates = source.use, source.interpolates
-        self.node = getattr(source, "node", None)  # of ROS 2
-        self._source, self._max_frames = source, max_frames
+        self.source, self._max_frames = source, max_frames
 
     def frames(self) -> Iterator[Frame]:
         """Up to ``max_frames`` frames; all if that is None."""
-        return islice(self._source.frames(), self._max_frames)
+        return islice(self.source.frames(), self._max_frames)
 
     def close(self) -> None:
         """Close the other source."""
-        self._source.close()
+        self.source.close()
 
 
 def paced(frames: Iterator[Frame]) -> Iterator[Frame]:

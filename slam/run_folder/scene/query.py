@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.errors import InputError, is_whole
+from bmask_slam.graph.errors import InputError, did_you_mean, is_whole
 from bmask_slam.run_folder.semantic_files import SavedObject, SavedScene, read_scene
 from bmask_slam.semantics.objects.relations import RELATIONS, distance_m, relations
 
@@ -78,9 +78,10 @@ def ask(run: Path, asked: Asked) -> Answer:
     counts = dict(sorted(Counter(o.label for o in scene.objects).items()))
     for name in (asked.label, None if is_whole(asked.other) else asked.other or None):
         if name is not None and name not in scene.names:
+            near = did_you_mean(name, scene.names[1:]).rstrip("?")
             raise InputError(
-                f"{run}: its label set has no {name!r}; the run holds {_listed(counts)}; the set "
-                f"has {', '.join(scene.names[1:])}"
+                f"{run}: its label set has no {name!r}{near}; the run holds {_listed(counts)}; "
+                f"the set has {', '.join(scene.names[1:])}"
             )
     chosen = [o for o in scene.objects if asked.label in (None, o.label)]
     others = _related(run, scene, asked)

@@ -178,7 +178,7 @@ def _depth_form(bag: Bag, topics: BagTopics, rgb_frame: str, depth_frame: str) -
     if not sdk and (rgb_frame == depth_frame or any(word in topics.depth for word in REGISTERED)):
         return DepthForm()
     known = (_SDK_COLOUR, _SDK_DEPTH) if sdk else (rgb_frame, depth_frame)
-    T_colour_depth = _sdk_extrinsics(bag) if sdk else _static_extrinsics(bag, *known)
+    T_colour_depth = _sdk_extrinsics(bag) if sdk else static_extrinsics(bag, *known)
     info = _info_topic(topics.depth)
     if T_colour_depth is None or info not in _infos(bag):
         logger.warning(
@@ -203,8 +203,8 @@ def _sdk_extrinsics(bag: Bag) -> Array | None:
     return poses[0] @ inverse(poses[1])
 
 
-def _static_extrinsics(bag: Bag, rgb_frame: str, depth_frame: str) -> Array | None:
-    """T_rgb_depth by the tree of /tf_static; None if it does not hold both frames."""
+def static_extrinsics(bag: Bag, rgb_frame: str, depth_frame: str) -> Array | None:
+    """T_rgb_depth of two frames by /tf_static; None if its tree does not hold both."""
     parents: dict[str, tuple[str, Array]] = {}
     for count, (_, message) in enumerate(bag.messages(TRANSFORMS)):
         if count == MAX_STATIC or not hasattr(message, "transforms"):
@@ -258,4 +258,6 @@ def first_message(bag: Bag, name: str) -> Any:
         if missing:
             raise InputError(f"{bag.path}: {name} has no {', '.join(sorted(missing))}")
         return message
-    raise InputError(f"{bag.path}: no message on {name}, though its index says so; it is damaged")
+    raise InputError(
+        f"{bag.path}: no message on {name}; the bag is damaged, or the publisher is silent"
+    )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.files.reading import read_lines
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.sequences.bags.bag_file import is_bag
@@ -34,6 +36,8 @@ from bmask_slam.sequences.lists import read_lists
 from bmask_slam.sequences.recording import Recording
 
 Given = Path | Camera | None
+MOST_BESIDE = 1000
+"""Names beside one that is not there, among which the one that was meant is looked for."""
 
 
 class Layout(NamedTuple):
@@ -83,9 +87,13 @@ def open_recording(path: Path, camera: Given = None) -> Recording:
                 raise InputError(f"{path}: is no plain file; give a recording of docs/data.md")
             return layout.open(path, camera)
     if not path.is_dir():
+        beside: list[str] = []
+        with suppress(OSError):  # no folder either, or one that may not be read
+            beside = [other.name for other in islice(path.parent.iterdir(), MOST_BESIDE)]
+        near = did_you_mean(path.name, beside)
         raise InputError(
             f"{path}: no such folder; give the folder that holds rgb.txt, or a recording in "
-            "another layout of docs/data.md"
+            f"another layout of docs/data.md{near}"
         )
     for layout in FOLDERS:
         if layout.is_one(path) and (layout.open is open_icl_nuim or not _has_lists(path)):

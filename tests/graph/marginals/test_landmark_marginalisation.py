@@ -221,6 +221,26 @@ def test_a_removed_observation_is_removed_from_its_group() -> None:
     assert np.abs(pose_differences(after, expected)).max() < 0.3 * off
 
 
+def test_a_culled_leaf_leaves_what_is_known_of_the_others() -> None:
+    """All that its observations say of other keyframes stays, in theirs and in the tree."""
+    smoother = filled()
+    smoother.optimise_batch()
+    before = marginalise_landmarks(smoother, smoother.tables.landmarks.ids)
+    links = [factor.link for factor in smoother.tables.pose_factors.values()]
+    ends = [k for link in links for k in link]
+    leaf = next(k for k in before.keyframe_ids[::-1].tolist() if ends.count(k) == 1)
+    other = next(k for k in before.keyframe_ids[::-1].tolist() if k != leaf)
+    known = smoother.marginal_covariance(other)
+    after = smoother.update(GraphUpdate(remove_keyframes=np.array([leaf])))
+    assert after.factors == before.factors - 1
+    left = before.keyframe_ids != leaf
+    np.testing.assert_allclose(after.poses_world_camera, before.poses_world_camera[left], atol=1e-9)
+    np.testing.assert_allclose(smoother.marginal_covariance(other), known, rtol=1e-6, atol=1e-15)
+    marginalised = smoother.tables.marginalised
+    assert not marginalised.chunks_with([leaf], [])
+    assert all(s.keyframe_id != leaf for s in marginalised.summaries.values())
+
+
 @pytest.mark.parametrize("what", ["landmark", "keyframe"])
 def test_removals_apply_to_marginalised_observations_too(what: str) -> None:
     smoother = filled()

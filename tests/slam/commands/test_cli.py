@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+import os
 import re
 import subprocess
 import sys
@@ -21,6 +23,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import write_tum
 from bmask_slam.offline.runner import RunSummary
 from bmask_slam.rendering.sequence import SCENES, RenderConfig
+from bmask_slam.runtime.progress import console_log
 from bmask_slam.system_config import SystemConfig
 
 HEAVY = ("numpy", "cv2", "gtsam", "open3d", "torch", "pydantic", "ruamel.yaml")
@@ -54,6 +57,16 @@ def test_help_answers_without_heavy_imports(arguments: list[str]) -> None:
     assert done.stdout.endswith("set()\n")
 
 
+def test_libraries_wait_without_spinning(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "3")  # a user's own choice
+    monkeypatch.setenv("OMP_WAIT_POLICY", "")
+    monkeypatch.delenv("OMP_WAIT_POLICY")
+    call(capsys, "--version")
+    assert [os.environ[name] for name in cli.WAITING] == ["3", "PASSIVE"]
+
+
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert call(capsys, "--version") == (0, f"bmask-slam {bmask_slam.__version__}\n", "")
 
@@ -70,6 +83,7 @@ def test_completion_knows_every_command(capsys: pytest.CaptureFixture[str]) -> N
     for command in ("run", "evaluate-segmentation", "compare"):
         assert command in output
     assert "--checkpoint-every" in output
+    assert "_shtab_bmask_slam_report_pos_0_COMPGEN=_shtab_compgen_files" in output
     assert subprocess.run(["bash", "-n"], input=output, text=True, check=True).returncode == 0
 
 
@@ -78,6 +92,39 @@ def test_no_command_and_a_wrong_one(capsys: pytest.CaptureFixture[str]) -> None:
     status, _, errors = call(capsys, "rum")
     assert status == 2
     assert "invalid choice: 'rum'" in errors
+    assert errors.endswith("; did you mean run?\n")
+    errors = call(capsys, "run", "x", "--qiuet")[2]
+    assert errors.endswith("unrecognized arguments: --qiuet; did you mean --quiet?\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (("run", "seq", "--config", "papre"), "paper"),
+        (("compare", "rendred"), "rendered"),
+        (("compare", "rendered", "--sequences", "offce"), "office"),
+        (("render", "livingroom", "--out", "x"), "living_room"),
+        (("run", "sq"), "seq"),
+    ],
+)
+def test_a_mistyped_name_is_suggested(capsys, sequence, monkeypatch, arguments, meant) -> None:
+    monkeypatch.chdir(sequence.parent)
+    status, _, errors = call(capsys, *arguments)
+    assert (status, errors.endswith(f"; did you mean {meant}?\n")) == (1, True), errors
+
+
+def test_results_as_json_and_the_log_on_stderr(capsys, sequence, tmp_path) -> None:
+    file = tmp_path / "path.txt"
+    write_tum(file, true_trajectory(5))
+    words = ("export", file, "--format", "kitti", "--out", tmp_path / "k.txt", "--json")
+    status, output, _ = call(capsys, *words)
+    assert (status, json.loads(output)["files"][0]) == (0, str(tmp_path / "k.txt"))
+    assert call(capsys, *words, "--quiet")[0] == 2
+    status, output, _ = call(capsys, "convert", sequence, tmp_path / "c", "--json", "-v")
+    assert (status, json.loads(output)["colour"]) == (0, 20)
+    with console_log(logging.INFO):
+        logging.getLogger("bmask_slam.x").info("done so far")
+    assert "INFO: done so far" in capsys.readouterr().err
 
 
 def test_run_prints_table_folder_and_picture(capsys, sequence: Path, tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from small_comparison import HOSTILE, WAVE_M, make_comparison
 
-from bmask_slam.comparison.experiment.metric_table import BY_NAME
 from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind, Method
 from bmask_slam.comparison.jobs.errors import Rules, trajectory_errors
 from bmask_slam.comparison.report import write_report
@@ -26,6 +25,7 @@ from bmask_slam.comparison.report.table import ATE, metric_table
 from bmask_slam.comparison.report.verdict_tables import ablation_table
 from bmask_slam.graph.metrics import ErrorStatistics
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
+from bmask_slam.reporting.metric_table import BY_NAME
 
 RULES = Rules(0.02)
 
@@ -161,6 +161,19 @@ def test_only_measured_se3_results_are_compared_for_the_best(comparison):
     tags = {row.label: row.tags for row in table.rows}
     assert tags["other"] == ("trajectory file", "Sim(3)")
     assert tags["paper"] == ("published",)
+
+
+def test_a_trajectory_that_covers_little_is_shown_but_never_the_best(comparison):
+    def covering(cell: Cell) -> Cell:
+        lost = cell.sequence == "two_x" and cell.method == HOSTILE
+        return replace(cell, metrics=cell.metrics | {"tracked_share": 0.17 if lost else 1.0})
+
+    cells = tuple(map(covering, comparison.cells))
+    table = metric_table(replace(comparison, cells=cells), ATE)
+    (entry,) = (row.entries[1] for row in table.rows if row.label == HOSTILE)
+    assert entry.text == "1.94"
+    assert entry.note.startswith("covers 17 %")
+    assert not any(row.entries[1].best for row in table.rows)
 
 
 def test_published_rows_have_their_source(page):

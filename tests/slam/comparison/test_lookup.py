@@ -94,6 +94,19 @@ def test_a_given_file_replaces_the_experiments(tmp_path):
     assert found.systems["ORB"].trajectories == {"xyz": str(file)}
 
 
+def test_a_pattern_gives_each_sequence_its_file(tmp_path):
+    make(tmp_path, "xyz-run1.txt")
+    files = dict([parse_trajectory(f"ORB:*={tmp_path}/{{sequence}}-*.txt")])
+    found = with_trajectories(experiment(tmp_path), files)
+    assert found.systems["ORB"].trajectories == {"xyz": str(tmp_path / "xyz-run1.txt")}
+    make(tmp_path, "xyz-run2.txt")
+    with pytest.raises(InputError, match="make it narrower"):
+        with_trajectories(experiment(tmp_path), files)
+    for text, wrong in (("ORB:*=x.txt", "write {sequence}"), ("ORB:*={sequence}", "no file fits")):
+        with pytest.raises(InputError, match=wrong):
+            with_trajectories(experiment(tmp_path), dict([parse_trajectory(text)]))
+
+
 def test_a_sequence_may_have_figures_from_two_sources(tmp_path):
     quoted = (
         Quotation("DVO", "one", figures={"ate_rmse": {"xyz": 0.01}, "tracked_share": {"xyz": 1}}),

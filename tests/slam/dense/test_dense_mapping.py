@@ -334,16 +334,19 @@ def test_a_run_can_fuse_keyframes_while_tracking(
 ) -> None:
     run = tmp_path / "run"
     often = "keyframes={max_shared: 1.1, min_interval_frames: 2, min_tracked: 5}"
-    arguments = ["run", str(room), "--max-frames", "24", "--map", "--segmenter", "truth"]
+    coarse = ["--mesh-voxel", "0.04"]
+    arguments = ["run", str(room), "--max-frames", "24", "--map", "--segmenter", "truth", *coarse]
     assert main([*arguments, "--set", often, "--out", str(run), "--quiet"]) == 0
     counts = json.loads((run / "dense" / "dense.json").read_text())
     total = counts["keyframes_fused"] + counts["keyframes_reused"]
     assert total == len(open_run(run).keyframes) >= 8
     assert counts["keyframes_reused"] >= total - 7 - len(counts["keyframes_left_out"])
     assert len(counts["label_shares"]) > 3
+    coarse_points = counts["points"]
     capsys.readouterr()
-    assert main(["map", str(run)]) == 0
+    assert main(["map", str(run)]) == 0  # with finer voxels
     assert f"0 fused, {total} were finished" in capsys.readouterr().out
+    assert json.loads((run / "dense" / "dense.json").read_text())["points"] > 3 * coarse_points
 
 
 def test_the_dense_map_of_an_overwritten_run_is_not_used(

@@ -40,6 +40,7 @@ def test_evaluation_rows():
         "rpe_trans_rmse_frame": "m", "rpe_rot_rmse_frame": "deg",
         "rpe_trans_rmse_second": "m", "rpe_rot_rmse_second": "deg",
         "associated_poses": "poses", "estimate_share": "1", "reference_share": "1",
+        "drift_trans": "1", "drift_rot": "deg/m",
         "tracked_share": "1",
     }  # fmt: skip
     # Independent noise of 1 cm an axis: sqrt(3) cm at a pose, twice the variance between two.
@@ -53,6 +54,23 @@ def test_evaluation_rows():
     assert result.value("ate_rot_rmse") == pytest.approx(rotation_deg, rel=0.06)
     assert result.value("tracked_share") == pytest.approx(0.75)
     assert len(result.per_second.timestamps_s) > 250
+
+
+def test_drift_is_the_error_over_the_length_of_the_path():
+    """A path that is 2 % too long and turns 3 degrees a metre that the reference does not turn."""
+    x_m = np.linspace(0, 10, 301)
+    poses = np.tile(np.eye(4), (301, 1, 1))
+    poses[:, 0, 3] = x_m
+    stretched = poses.copy()
+    stretched[:, 0, 3] *= 1.02
+    stamps_s = x_m / 3
+    reference = Trajectory(stamps_s, poses)
+    longer = evaluate_trajectory(Trajectory(stamps_s, stretched), reference)
+    assert longer.value("drift_trans") == pytest.approx(0.02, rel=0.02)
+    assert longer.value("drift_rot") == pytest.approx(0, abs=1e-6)
+    turned = poses @ se3_exp(np.deg2rad(3) * x_m[:, None] * np.eye(6)[0])
+    turning = evaluate_trajectory(Trajectory(stamps_s, turned), reference)
+    assert turning.value("drift_rot") == pytest.approx(3, rel=0.02)
 
 
 def test_tracked_and_evaluated_shares():

@@ -21,6 +21,7 @@ from bmask_slam.live.start import LiveOptions
 FRAMES, ALL_FRAMES = 24, 60
 SHORT = ("--max-frames", str(FRAMES))
 UNCALIBRATED = ("--segmenter", "none", "--calibrate", "off")
+COARSE = ("--mesh-voxel", "0.02")
 
 
 def start(recording: Path, out: Path, *options: str) -> subprocess.Popen[str]:
@@ -60,13 +61,13 @@ def test_a_live_dense_map_equals_the_offline_one_and_can_be_continued(
 ) -> None:
     """After a dropped frame, keyframe numbers differ from image numbers."""
     out, offline, some = tmp_path / "live", tmp_path / "offline", ("--max-frames", "16")
-    live = start(slow_office, out, "--realtime", "--map", *UNCALIBRATED, *some)
+    live = start(slow_office, out, "--realtime", "--map", *COARSE, *UNCALIBRATED, *some)
     output, errors = live.communicate(timeout=300)
     assert live.returncode == 0, errors
     assert "Dense map" in output
     common = [str(slow_office), "--segmenter", "none", "--out", str(offline), "--quiet", *some]
     assert main(["run", *common]) == 0
-    assert main(["map", str(offline), "--quiet"]) == 0
+    assert main(["map", str(offline), *COARSE, "--quiet"]) == 0
     clouds = [read_ply(path / "dense" / "cloud.ply") for path in (out, offline)]
     live_points, offline_points = (np.stack([c[axis] for axis in "xyz"], axis=1) for c in clouds)
     for found, other in ((live_points, offline_points), (offline_points, live_points)):
@@ -76,14 +77,16 @@ def test_a_live_dense_map_equals_the_offline_one_and_can_be_continued(
     fused = sorted((out / "dense" / "depth").iterdir())
     fused[0].unlink()
     capsys.readouterr()
-    assert main(["map", str(out)]) == 0
+    assert main(["map", str(out), *COARSE]) == 0
     summary = capsys.readouterr().out
     assert f"1 fused, {len(fused) - 1} were finished" in summary
     assert "left out" not in summary
 
 
 @pytest.mark.parametrize(
-    ("number", "options"), [(signal.SIGINT, ["--map"]), (signal.SIGTERM, [])], ids=["INT", "TERM"]
+    ("number", "options"),
+    [(signal.SIGINT, ["--map", *COARSE]), (signal.SIGTERM, [])],
+    ids=["INT", "TERM"],
 )
 def test_a_signal_ends_it_with_everything_saved(slow_office, tmp_path, number, options) -> None:
     out = tmp_path / "run"

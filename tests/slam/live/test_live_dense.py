@@ -70,7 +70,7 @@ def test_a_process_that_is_killed_and_one_that_hangs_are_replaced_without_losing
 ) -> None:
     clock, run = Clock(), tmp_path / "run"
     monkeypatch.setattr(supervision, "time", clock)
-    with LiveSlam(CAMERA, CONFIG, LiveOptions(run, dense=True)) as slam:
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(run, dense=True, mesh_voxel_m=0.03)) as slam:
         track_frames(slam, FRAMES[:7], 0)
         killed = slam.processes()["dense"]
         os.kill(killed, signal.SIGKILL)
@@ -99,7 +99,7 @@ def test_on_a_full_disk_tracking_continues_and_missing_submaps_are_reported(
     small_disk, caplog
 ) -> None:
     run = small_disk / "run"
-    with LiveSlam(CAMERA, CONFIG, LiveOptions(run, dense=True)) as slam:
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(run, dense=True, mesh_voxel_m=0.03)) as slam:
         track_frames(slam, FRAMES[:4], 0)
         ballast = fill(small_disk)
         assert set(track_frames(slam, FRAMES[4:], 0)) == {TrackingStatus.OK}

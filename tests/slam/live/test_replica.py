@@ -139,3 +139,24 @@ def test_digests_tell_rows_apart() -> None:
         altered[20:22] = -altered[20:22]  # two signs: they must not cancel
         assert np.flatnonzero(digest_rows(changed) != digests).tolist() == [20, 21]
     assert len(digest_rows([c[:0] for c in columns])) == 0
+
+
+def test_only_what_changed_is_sent(followed) -> None:
+    """A second reader does not hide changes from the first."""
+    system, *_ = followed
+    world, history = system.mapper.world, system.mapper.history
+    first, second = DeltaMaker(), DeltaMaker()
+    first.delta(world, history)
+    second.delta(world, history)
+    moved, seen, coloured = np.flatnonzero(world.landmarks.in_map)[[3, 5, 7]]
+    world.landmarks.points_world[moved] += 1e-9
+    world.landmarks.observations[seen] += 1
+    world.landmarks.colours[coloured] = 7
+    keyframe = list(world.keyframes.values())[-1]
+    world.unmask(keyframe, np.arange(1))
+    for maker in (first, second):
+        delta = maker.delta(world, history)
+        assert delta.moved.tolist() == [moved]
+        assert delta.ids.tolist() == sorted([seen, coloured])
+        assert list(delta.rows) == [keyframe.id]
+    world.landmarks.observations[seen] -= 1

@@ -71,6 +71,26 @@ def test_votes_equal_the_definition(config: IndexConfig, rng: np.random.Generato
     assert (np.diff(votes.scores) <= 0).all()
 
 
+@pytest.mark.parametrize("config", [WHOLE, PARTITIONED])
+def test_a_search_ahead_gives_the_same_votes(config: IndexConfig, rng: np.random.Generator) -> None:
+    """Also of other descriptors, and after a change of the index."""
+    keyframes = {k: random_descriptors(60, rng) for k in range(8)}
+    index, plain = DescriptorIndex(config), DescriptorIndex(config)
+    for k, descriptors in keyframes.items():
+        index.add(k, descriptors)
+        plain.add(k, descriptors)
+    for change in (None, 3, 4, 5, 6, 7):  # with the last of them the index is built anew
+        query, other = (changed(keyframes[k], 10, rng) for k in (0, 1))
+        index.search_ahead(query)
+        if change is not None:
+            index.remove(change)
+            plain.remove(change)
+        for descriptors in (other, query):
+            votes, expected = index.votes(descriptors), plain.votes(descriptors)
+            assert votes.keyframe_ids.tolist() == expected.keyframe_ids.tolist()
+            assert votes.scores.tolist() == expected.scores.tolist()
+
+
 def test_the_distance_threshold_is_inclusive(rng: np.random.Generator) -> None:
     place = random_descriptors(40, rng)
     index = DescriptorIndex()

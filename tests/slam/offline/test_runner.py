@@ -101,7 +101,6 @@ def test_frames_csv(sequence: Path, out: Path) -> None:
     assert (row["timestamp"], row["status"], row["matches"]) == ("1.500000", "OK", "115")
     assert (row["inliers"], row["keyframe"], row["keyframe_reason"]) == ("105", "3", "new view")
     assert (row["tracking_ms"], row["graph_ms"]) == ("1015.000", "7000000.000")
-    assert 0 <= float(row["features_ms"]) < 1000
     assert (rows[6]["status"], rows[6]["keyframe"]) == ("LOST", "")
 
 
@@ -184,7 +183,7 @@ def test_a_reference_of_another_time_is_rejected_before_the_run(
 
 def test_a_run_without_poses_finishes(sequence: Path, out: Path, caplog) -> None:
     class Lost(FakeSystem):
-        def prepare(self, frame):
+        def number(self, frame):
             return 6  # a number that is lost
 
     summary = run(RunOptions(sequence, out=out, quiet=True), Lost)

@@ -11,6 +11,7 @@ from repository import KITCHEN
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences import format_info, open_sequence, sequence_info
+from bmask_slam.sequences.prefetch import prefetched
 
 
 def prefetch_threads() -> int:
@@ -35,26 +36,21 @@ def test_frames(folder):
 
 
 @pytest.mark.parametrize("prefetch", [0, 1, 4, 100])
-def test_slices_and_prepare(folder, prefetch):
-    sequence = open_sequence(folder)
-    indices = [f.index for f in sequence.frames(2, 11, 4, prefetch=prefetch)]
-    assert indices == [2, 6, 10]
-    pairs = list(sequence.frames(stride=5, prefetch=prefetch, prepare=lambda f: f.index**2))
-    assert [(f.index, x) for f, x in pairs] == [(0, 0), (5, 25), (10, 100)]
+def test_slices(folder, prefetch):
+    frames = open_sequence(folder).frames(2, 11, 4, prefetch=prefetch)
+    assert [f.index for f in frames] == [2, 6, 10]
 
 
-def test_prepare_runs_ahead_in_one_other_thread(folder):
+def test_one_other_thread_works_ahead():
     names = []
-    frames = open_sequence(folder).frames(
-        prepare=lambda _: names.append(threading.current_thread().name)
-    )
-    next(frames)
+    items = prefetched((names.append(threading.current_thread().name) for _ in range(12)), 4)
+    next(items)
     deadline = time.monotonic() + 60
     while len(names) < 5 and time.monotonic() < deadline:
         time.sleep(0.005)
     time.sleep(0.02)
     assert names == ["prefetch_0"] * 5  # one consumed, four waiting
-    frames.close()
+    items.close()
 
 
 def test_early_stop_ends_the_thread(folder):
@@ -65,35 +61,30 @@ def test_early_stop_ends_the_thread(folder):
     assert prefetch_threads() == 0
 
 
-def test_early_stop_wastes_no_work(folder):
-    """Only the current frame is finished; waiting ones are not prepared."""
-    prepared, begun, go = [], threading.Event(), threading.Event()
+def test_early_stop_wastes_no_work():
+    """Only the current item is finished; waiting ones are not begun."""
+    begun_items, begun, go = [], threading.Event(), threading.Event()
 
-    def prepare(frame):
-        prepared.append(frame.index)
-        if frame.index:
+    def work(index):
+        begun_items.append(index)
+        if index:
             begun.set()
             assert go.wait(5)
 
-    frames = open_sequence(folder).frames(prepare=prepare)
-    next(frames)
+    items = prefetched(map(work, range(12)), 4)
+    next(items)
     assert begun.wait(5)
     threading.Timer(0.05, go.set).start()
-    frames.close()
-    assert prepared == [0, 1]
+    items.close()
+    assert begun_items == [0, 1]
 
 
-def test_exceptions_are_passed_to_the_consumer(folder):
-    def prepare(frame):
-        if frame.index == 3:
-            raise ZeroDivisionError("from prepare")
-        return frame.index
-
-    prepared = []
-    with pytest.raises(ZeroDivisionError, match="from prepare"):
-        for _, x in open_sequence(folder).frames(prepare=prepare):
-            prepared.append(x)
-    assert prepared == [0, 1, 2]
+def test_exceptions_are_passed_to_the_consumer():
+    received = []
+    with pytest.raises(ZeroDivisionError):
+        for item in prefetched((6 // (3 - k) for k in range(12)), 4):
+            received.append(item)
+    assert received == [2, 3, 6]
     assert prefetch_threads() == 0
 
 

@@ -151,3 +151,24 @@ def test_a_frame_begins_no_map_segment_while_the_back_end_accepts_no_keyframe() 
     assert camera_tracker.segment == 1
     map_reader.accepts_keyframes = False
     assert camera_tracker.track(features).status is TrackingStatus.LOST
+
+
+def test_a_lost_frame_is_tracked_on_in_the_segment_where_it_is_recognised(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    map_reader = StillMap()
+    camera_tracker, tracker, features = scene(map_reader)
+    points = points_before(np.eye(4), 20, np.random.default_rng(1))
+    here = make_features(np.eye(4), points, np.zeros((20, 8), np.uint64))
+    other = add_keyframe(map_reader.world, STEP, here)
+    other.segment = 3
+    ids = map_reader.world.make_landmarks(other, np.arange(20), points)
+    found = replace(untracked(STEP, here), keypoints=np.arange(20), landmark_ids=ids)
+    monkeypatch.setattr(
+        camera_tracker, "recognise", lambda _, where: found if other in where else None
+    )
+    tracker.is_lost = True
+    tracked = camera_tracker.track(features)
+    assert tracked is found
+    assert camera_tracker.segment == 3 and camera_tracker.reference is other
+    np.testing.assert_array_equal(camera_tracker.local_ids, ids)

@@ -1,10 +1,21 @@
 """The keyframe rules as tables: ORB-SLAM's, and the paper's Algorithm 2 as printed."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
+from synthetic_view import CAMERA, add_keyframe, make_features, points_before
 
-from bmask_slam.tracking.keyframe_decision import KeyframeConfig, KeyframeEvidence, keyframe_reason
+from bmask_slam.tracking.keyframe_decision import (
+    STARVING,
+    KeyframeConfig,
+    KeyframeDecision,
+    KeyframeEvidence,
+    keyframe_reason,
+)
+from bmask_slam.world.world_map import WorldMap
 
 # Numbers of their own, so that the tables do not follow the defaults about.
 ORB = KeyframeConfig(
@@ -97,3 +108,22 @@ def test_the_default_rule_equals_orb_slams() -> None:
     assert keyframe_reason(DUE, ORB) == keyframe_reason(
         DUE, replace(KeyframeConfig(), max_shared=0.7)
     )
+
+
+@pytest.mark.parametrize(
+    ("now_s", "shared", "is_known"),
+    [(120.0, 10, True), (119.9, 10, False), (120.0, 9, False), (60.0, 10, True)],
+)
+def test_close_points_may_run_out_where_an_old_keyframe_shows_the_view(
+    now_s: float, shared: int, is_known: bool
+) -> None:
+    world, points = WorldMap(), points_before(np.eye(4), 20, np.random.default_rng(1))
+    features = make_features(np.eye(4), points, np.zeros((20, 8), np.uint64))
+    keyframe = add_keyframe(world, np.eye(4), features)
+    keyframe.timestamp_s = 100.0
+    ids = world.make_landmarks(keyframe, np.arange(20), points)
+    tracker: Any = SimpleNamespace(timestamp_s=now_s, reference=keyframe)
+    map_reader: Any = SimpleNamespace(world=world)
+    decision = KeyframeDecision(CAMERA, KeyframeConfig(), map_reader, tracker)
+    assert decision._known_view(ids[:shared], keyframe, STARVING) is is_known
+    assert not decision._known_view(ids, keyframe, "new view")

@@ -10,6 +10,7 @@ from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.tracking.pose_optimisation import (
     PoseOptimisationConfig,
     jacobian,
+    median,
     optimise_pose,
     residuals,
 )
@@ -211,6 +212,12 @@ def test_the_pose_is_a_rigid_transform() -> None:
     np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
 
 
+@pytest.mark.parametrize("count", [1, 2, 7, 10])
+def test_the_median_is_numpys(count: int) -> None:
+    values = np.random.default_rng(count).normal(size=count)
+    assert median(values) == np.median(values)
+
+
 def test_the_fast_normal_equations_equal_those_of_the_jacobian() -> None:
     rng = np.random.default_rng(5)
     points, measured = scene(50, rng)
@@ -221,8 +228,9 @@ def test_the_fast_normal_equations_equal_those_of_the_jacobian() -> None:
     J = jacobian(points_camera, CAMERA)
     chi2 = (r**2 * weight).sum(axis=1)
     matches = Reprojection.of(points, measured, weight, CAMERA)
-    np.testing.assert_allclose(matches.chi2(T_WORLD_CAMERA)[0], chi2, rtol=1e-9)
-    np.testing.assert_allclose(matches.chi2(T_WORLD_CAMERA)[2], points_camera[:, 2])
+    squares, z = matches.squares(T_WORLD_CAMERA)
+    np.testing.assert_allclose((squares * matches.weight).sum(axis=0), chi2, rtol=1e-9)
+    np.testing.assert_allclose(z, points_camera[:, 2])
     for cauchy, factor in ((None, 1.0), (kernel, kernel / (kernel + chi2))):
         w = weight * np.reshape(factor, (-1, 1))
         H, g = matches.normal_equations(T_WORLD_CAMERA, cauchy)

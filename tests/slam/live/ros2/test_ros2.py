@@ -7,16 +7,16 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip("cyclonedds")
 
-from ros2_player import BEGIN_S, pose
+from ros2_player import BEGIN_S, T_BASE_CAMERA, T_ODOM_MAP, example_message, pose
 
 from bmask_slam.cli import main
+from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import (
     inverse,
@@ -25,16 +25,21 @@ from bmask_slam.graph.geometry import (
     se3_exp,
     se3_log,
 )
-from bmask_slam.live.ros2.dds import carried_type, dds_name, idl_struct, ros_name, typestore
-from bmask_slam.live.ros2.outputs import OPTICAL, Ros2Frames, ros_covariance
+from bmask_slam.graph.sensors.mounting import T_of
+from bmask_slam.live.ros2.dds import carried_type, dds_name, ros_name, typestore
+from bmask_slam.live.ros2.messages import ros_covariance
+from bmask_slam.live.ros2.outputs import OPTICAL, Ros2Frames
 from bmask_slam.live.sources.opening import SourceOptions, open_source
+from bmask_slam.system_config import SystemConfig
 
 TYPES = (
     "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo",
     "sensor_msgs/msg/Imu", "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry",
     "nav_msgs/msg/Path", "nav_msgs/msg/OccupancyGrid", "tf2_msgs/msg/TFMessage",
     "geometry_msgs/msg/PoseWithCovarianceStamped", "visualization_msgs/msg/MarkerArray",
-    "diagnostic_msgs/msg/DiagnosticArray",
+    "diagnostic_msgs/msg/DiagnosticArray", "vision_msgs/msg/Detection3DArray",
+    "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PointStamped",
 )  # fmt: skip
 LOOPBACK = """<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterface name="lo"
 multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast></General><Discovery>
@@ -43,36 +48,11 @@ multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast></General>
 DOMAIN, FRAMES = 77, 10
 
 
-def example(name: str, rng: np.random.Generator, as_idl: bool) -> Any:
-    """A message with random values: of rosbags, or of the struct that cyclonedds knows."""
-    store = typestore()
-    values = {f: _value(kind, rng, as_idl) for f, kind in store.fielddefs[name][1]}
-    return (idl_struct(name) if as_idl else store.types[name])(**values)
-
-
-def _value(kind: Any, rng: np.random.Generator, as_idl: bool) -> Any:
-    node, described = kind[0].name, kind[1]
-    if node == "NAME":
-        return example(described, rng, as_idl)
-    if node == "BASE":
-        base = described[0]
-        if base == "string":
-            return "abcdefgh"[: int(rng.integers(0, 8))]
-        if base == "bool":
-            return bool(rng.integers(0, 2))
-        return float(np.float32(rng.normal())) if "float" in base else int(rng.integers(0, 100))
-    count = described[1] if node == "ARRAY" else int(rng.integers(1, 4))
-    values = [_value(described[0], rng, as_idl) for _ in range(count)]
-    if as_idl or described[0][0].name == "NAME" or described[0][1][0] == "string":
-        return values
-    return np.array(values, described[0][1][0])
-
-
 @pytest.mark.parametrize("name", TYPES)
 def test_bytes_are_those_of_rosbags(name: str) -> None:
     for seed in range(3):
-        ours = example(name, np.random.default_rng(seed), True)
-        theirs = example(name, np.random.default_rng(seed), False)
+        ours = example_message(name, np.random.default_rng(seed), True)
+        theirs = example_message(name, np.random.default_rng(seed))
         expected = bytes(typestore().serialize_cdr(theirs, name))
         found = ours.serialize(use_version_2=False)
         assert found[4:] == expected[4:].ljust(len(found) - 4, b"\0")
@@ -125,31 +105,41 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
     helpers = Path(__file__).parents[3] / "helpers"
     path = os.pathsep.join([str(helpers), *filter(None, sys.path)])
     words = [sys.executable, helpers / "ros2_player.py", DOMAIN, 10, tmp_path / "heard"]
-    with subprocess.Popen(list(map(str, words)), env={**os.environ, "PYTHONPATH": path}) as player:
+    env = {**os.environ, "PYTHONPATH": path}
+    with subprocess.Popen(list(map(str, words)), env=env, stdin=subprocess.PIPE) as player:
         out = tmp_path / "run"
-        options = ("--segmenter", "none", "--calibrate", "off", "--quiet", "--silence", "30")
+        options = (
+            "--segmenter",
+            "none",
+            "--odometry-topic",
+            "/odom",
+            "--calibrate",
+            "off",
+            "--quiet",
+            "--silence",
+            "30",
+        )
         code = main(["live", f"ros2:{DOMAIN}", "--out", str(out), "--max-frames", str(FRAMES - 2),
                      *options])  # fmt: skip
-        if code:
-            player.kill()
-        assert code == 0
-        assert player.wait(60) == 0
+        player.communicate(timeout=60)
+        assert (code, player.returncode) == (0, 0)
     heard = json.loads((tmp_path / "heard").read_text())
     odometry = heard["/bmask_slam/odometry"]
     assert len(odometry) >= FRAMES - 4  # of best effort
-    assert {(o["frame"], o["child"]) for o in odometry} == {("odom", "base_link")}
+    assert {(o["frame"], o["child"]) for o in odometry} == {("map", "base_link")}
     for one in odometry:
         k = round(30 * (one["stamp_s"] - BEGIN_S))
         R = rotation_from_quaternion(np.array(one["quaternion"]))
         found = make_pose(R, np.array(one["position"]))
-        expected = OPTICAL @ inverse(pose(0)) @ pose(k) @ inverse(OPTICAL)
+        expected = T_BASE_CAMERA @ inverse(pose(0)) @ pose(k) @ inverse(T_BASE_CAMERA)
         assert np.allclose(found, expected, atol=0.003)
     links = {tuple(link) for tf in heard["/tf"] + heard["/tf_static"] for link in tf["links"]}
-    assert links == {
-        ("map", "odom"), ("odom", "base_link"), ("base_link", "camera_optical_frame")
-    }  # fmt: skip
+    assert links == {("map", "odom"), ("base_link", "camera")}  # the second is the player's
+    assert np.allclose(heard["/tf"][-1]["moved"], inverse(T_ODOM_MAP)[:3, 3], atol=0.003)
     assert heard["/bmask_slam/landmarks"][-1]["points"] > 50
     assert heard["/bmask_slam/landmarks"][-1]["fields"] == ["x", "y", "z", "rgb"]
     assert heard["/bmask_slam/path"][-1]["poses"] >= 1
     assert heard["/diagnostics"][-1]["status"] == "OK"
     assert len(heard["/bmask_slam/pose"]) == len(odometry)
+    mounting = resolve(SystemConfig, out / "config.yaml").sensors.odometry.camera_in_base
+    assert np.allclose(T_of(mounting), T_BASE_CAMERA)

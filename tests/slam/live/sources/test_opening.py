@@ -134,7 +134,7 @@ def test_run_and_map_on_a_bag(recording: Sequence, bag: Path, tmp_path: Path, ca
     assert np.allclose(found.timestamps_s, 1000 + np.delete(recording.timestamps_s, 2), atol=1e-6)
     T_first_last = inverse(found.poses_world_camera[0]) @ found.poses_world_camera[-1]
     assert np.allclose(T_first_last, inverse(TRUTH[0]) @ TRUTH[-1], atol=0.002)
-    assert main(["map", str(out), "--quiet"]) == 0
+    assert main(["map", str(out), "--mesh-voxel", "0.04", "--quiet"]) == 0
     assert (out / "dense" / "cloud.ply").is_file()
 
 

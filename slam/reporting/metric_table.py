@@ -35,6 +35,8 @@ METRICS = (
     Metric("rpe_rot_rmse_second", "RPE a second, rotation", "°"),
     Metric("rpe_trans_rmse_metre", "RPE a metre", "cm", 100.0),
     Metric("rpe_rot_rmse_metre", "RPE a metre, rotation", "°"),
+    Metric("drift_trans", "drift", "%", 100.0),
+    Metric("drift_rot", "drift, rotation", "°/m"),
     Metric("tracked_share", "tracked", "%", 100.0, 1, lower_is_better=False),
     Metric("evaluated_share", "evaluated", "%", 100.0, 1, lower_is_better=None),
     Metric("tracking_ms_median", "time a frame, median", "ms", digits=1),

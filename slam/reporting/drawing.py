@@ -10,7 +10,7 @@ from typing import Any
 import matplotlib
 from matplotlib.figure import Figure
 
-from bmask_slam.comparison.report.section import Picture
+from bmask_slam.reporting.parts import Picture
 
 SVG = "image/svg+xml"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")

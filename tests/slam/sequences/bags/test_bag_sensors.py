@@ -11,7 +11,7 @@ from recorded_bags import TYPES
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.live.bag_sensors import SensorTopics, east_north_up, read_sensors
+from bmask_slam.sequences.bags.sensors import SensorTopics, east_north_up, read_sensors
 
 STORE = TYPES[False]
 T = STORE.types

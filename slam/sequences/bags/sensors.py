@@ -19,13 +19,13 @@ from bmask_slam.sequences.bags.bag_file import open_bag
 from bmask_slam.sequences.bags.ros_images import stamp_s
 
 _IMU, _ODOMETRY = "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
-_FIX, _POSE = "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PoseStamped"
+FIX, _POSE = "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PoseStamped"
 _POINT = "geometry_msgs/msg/PointStamped"
 TYPES: dict[str, tuple[str, ...]] = {
     "imu": (_IMU,),
     "accelerometer": (_IMU,),
     "odometry": (_ODOMETRY, _POSE),
-    "position": (_FIX, _POSE, _POINT, _ODOMETRY),
+    "position": (FIX, _POSE, _POINT, _ODOMETRY),
 }
 """The types of messages that each sensor may have."""
 WGS84_A_M, WGS84_E2 = 6378137.0, 6.69437999014e-3
@@ -66,7 +66,7 @@ def read_sensors(path: Path, wanted: SensorTopics) -> list[Measurements]:
                 )
         for topic, message in bag.messages(*topics.values()):
             for sensor in (sensor for sensor, name in topics.items() if name == topic):
-                row = _ROWS[sensor](message, kinds[topic])
+                row = sensor_row(sensor, message, kinds[topic])
                 if np.isfinite(row[:-1]).all() and (sensor == "position" or np.isfinite(row[-1])):
                     rows[sensor].append([stamp_s(message.header), *row])
     return [_measured(s, rows[s], f"{path}, {topics[s]}", kinds[topics[s]]) for s in topics]
@@ -77,7 +77,7 @@ def _measured(sensor: str, rows: list[list[float]], where: str, kind: str) -> Me
         raise InputError(f"{where}: no usable measurement; leave the topic out")
     table = np.array(rows)
     table = table[np.unique(table[:, 0], return_index=True)[1]]
-    if kind == _FIX:
+    if kind == FIX:
         table[:, 1:4] = east_north_up(table[:, 1:4])
     return measurements(sensor, table, where)
 
@@ -92,6 +92,11 @@ def east_north_up(fixes: Array) -> Array:
     (s, c), (t, d) = (np.sin(lat[0]), np.cos(lat[0])), (np.sin(lon[0]), np.cos(lon[0]))
     R_enu_ecef = np.array([[-t, d, 0], [-s * d, -s * t, c], [c * d, c * t, s]])
     return np.asarray((ecef - ecef[0]) @ R_enu_ecef.T)
+
+
+def sensor_row(sensor: str, message: Any, kind: str) -> list[float]:
+    """A measurement in the sensor's columns, without its stamp; a satellite fix in degrees."""
+    return _ROWS[sensor](message, kind)
 
 
 def _imu(message: Any, _: str) -> list[float]:
@@ -109,7 +114,7 @@ def _odometry(message: Any, kind: str) -> list[float]:
 
 
 def _position(message: Any, kind: str) -> list[float]:
-    if kind == _FIX:
+    if kind == FIX:
         known = message.position_covariance_type > 0
         variance = np.mean(np.asarray(message.position_covariance, float).reshape(3, 3).diagonal())
         sigma = float(np.sqrt(variance)) if known and variance > 0 else np.nan

@@ -1,0 +1,117 @@
+"""The map of a live run while it grows: what it is asked, and what is added to it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from bmask_slam.graph.arrays import Array, Floats
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.sensors.streams import Measurements
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.labelling.results import LandmarkCloud, MapObjects
+from bmask_slam.live.messages import MapSaved, SaveMap
+from bmask_slam.live.start import LiveOptions
+from bmask_slam.live.system import LiveSystem
+from bmask_slam.sensor_input import SensorInput
+
+MAX_MAP_WAIT_S = 1.0
+"""Longest time that one call of ``catch_up`` waits for the map."""
+
+
+class LiveMap(SensorInput):
+    """What `LiveSlam` has besides frames; its methods are for the thread that tracks."""
+
+    options: LiveOptions
+    _system: LiveSystem
+
+    def add_measurements(self, new: Measurements) -> None:
+        """Use the measurements of a sensor with the next frame; from any thread."""
+        self._system.add_measurements(new)
+
+    def add_factor(self, factor: Any) -> int:
+        """See `SensorInput.add_factor`; from the thread that tracks. A refusal is an event."""
+        return self._system.add_factor(factor)
+
+    def remove_factor(self, number: int) -> None:
+        """See `SensorInput.remove_factor`."""
+        self._system.remove_factor(number)
+
+    @property
+    def calibration(self) -> str:
+        """What was found of the camera, in one line; "" if nothing, or if it was not tried."""
+        found = self._system.calibration
+        return "" if found is None else found.text
+
+    def trajectory(self) -> Trajectory:
+        """Every frame of the largest map segment so far, from the keyframes' present poses."""
+        return self._system.trajectory()
+
+    def map(self) -> LandmarkCloud:
+        """The landmarks of the largest map segment at present."""
+        return self._system.landmarks()
+
+    def catch_up(self, waiting: float = math.inf) -> None:
+        """Apply the other processes' results; wait until at most ``waiting`` keyframes are pending.
+
+        The wait ends after ``MAX_MAP_WAIT_S`` in any case.
+        """
+        self._system.wait_for_map(waiting, MAX_MAP_WAIT_S)
+
+    def processes(self) -> dict[str, int]:
+        """Process ids by name."""
+        system = self._system
+        owners = {"map": system.remote, "segmenter": system.segmenter, "dense": system.dense}
+        last = {} if system.calibration is None else {"calibration": system.calibration.pid}
+        return {name: part.worker.pid for name, part in owners.items() if part is not None} | last
+
+    def segment(self) -> int:
+        """The number of the largest map segment, which ``map`` and ``trajectory`` are of."""
+        return self._system.remote.world.largest_segment()
+
+    def keyframe_poses(self) -> dict[int, Array]:
+        """The present T_world_camera (4, 4) of the keyframes of the largest segment, by id."""
+        world = self._system.remote.world
+        return {k.id: k.T_world_camera for k in world.in_segment(world.largest_segment())}
+
+    def objects(self) -> MapObjects | None:
+        """The objects as the map's process told them last; it is asked for newer ones.
+
+        None before its first answer, and without a segmenter.
+        """
+        if self._system.segmenter is not None:
+            self._system.remote.ask_for_objects()
+        return self._system.remote.objects
+
+    def on_submap(self, listener: Callable[[int, Floats], None]) -> None:
+        """Call with each submap of the dense map: its keyframe's id, points (N, 3) in its frame.
+
+        Nothing is called without a dense map, or with `LiveOptions.submap_points` 0.
+        """
+        dense = self._system.dense
+        if dense is not None:
+            dense.listeners.append(listener)
+            dense.keeps_previews = self.options.view.enabled
+
+    @property
+    def extends(self) -> bool:
+        """Whether keyframes are made; False: frames are only located in the map as it is."""
+        return self._system.remote.extends
+
+    @extends.setter
+    def extends(self, extends: bool) -> None:
+        if not extends and not self._system.remote.world.keyframes:
+            raise InputError("there is no map yet to be located in")
+        self._system.remote.extends = extends
+
+    def save_map(self, path: Path) -> None:
+        """Let the map's process write a file as RUN/map; ``saved_maps`` says when it is there."""
+        self._system.remote.send(SaveMap(path))
+
+    def saved_maps(self) -> list[MapSaved]:
+        """What was saved since the last call, or why not."""
+        saved = list(self._system.remote.maps_saved)
+        self._system.remote.maps_saved.clear()
+        return saved

@@ -1,0 +1,133 @@
+"""When a live run's results are published: poses at once, maps and health from time to time."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict
+from typing import Any, Protocol
+
+import numpy as np
+
+from bmask_slam.graph.arrays import Array, Floats
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.labelling.results import LandmarkCloud, MapObjects
+from bmask_slam.live.ros2.dds import Node
+from bmask_slam.live.ros2.grid import GridOptions, LiveGrid
+from bmask_slam.live.ros2.outputs import Robot, Ros2Frames, Ros2Outputs
+from bmask_slam.tracking.results import FrameResult, TrackingStatus
+
+logger = logging.getLogger(__name__)
+
+PERIOD_S, OBJECTS_S, GRID_S = 1.0, 3.0, 5.0
+"""Between two messages with path, landmarks and health; with objects; with the grid."""
+GRID_SHARE = 0.1
+"""Of a processor that the grid may take: it is made less often if it takes longer."""
+NICENESS = 15
+MAX_POSES, MAX_POINTS = 1000, 20_000
+"""Of the path, and of landmarks, those seen most often, in a message."""
+
+
+class LiveRun(Protocol):
+    """What ``Ros2Publisher`` asks of a live run; `LiveSlam` has it."""
+
+    def map(self) -> LandmarkCloud: ...
+    def trajectory(self) -> Trajectory: ...
+    def health(self) -> Any: ...
+    def segment(self) -> int: ...
+    def keyframe_poses(self) -> dict[int, Array]: ...
+    def objects(self) -> MapObjects | None: ...
+    def on_submap(self, listener: Callable[[int, Floats], None]) -> None: ...
+
+
+class Ros2Publisher:
+    """Called with the result of each frame; publishes it, and maps and health when they are due.
+
+    A frame of another map segment than the largest is as good as lost: its pose is in no frame
+    that ROS knows, until the two are joined.
+    """
+
+    def __init__(self, node: Node, frames: Ros2Frames, robot: Robot) -> None:
+        self._outputs, self._ros_time = Ros2Outputs(node, frames, robot), robot.ros_time
+        options = GridOptions(
+            frames.grid_resolution_m,
+            frames.grid_low_m,
+            frames.grid_high_m,
+            frames.floor_m if robot.is_known else None,
+        )
+        self._grid = LiveGrid(robot.T_base_camera, options)
+        self._thread = ThreadPoolExecutor(1, "grid", _with_low_priority)
+        self._making: Future[float] | None = None
+        self._run: LiveRun | None = None
+        self._segment = 0
+        self._due_s = {"map": 0.0, "objects": 0.0, "grid": 0.0}
+        self._told: MapObjects | None = None
+
+    def __call__(self, result: FrameResult, run: LiveRun) -> None:
+        """Publish a result, and what is due."""
+        if run is not self._run:
+            self._run = run
+            run.on_submap(self._grid.add)
+        if result.segment != self._segment and result.status is not TrackingStatus.LOST:
+            self._segment_may_have_changed(run)
+        self._outputs.frame(result, known=result.segment == self._segment)
+        stamp_s = self._ros_time(result.timestamp_s)
+        if self._is_due("map", PERIOD_S):
+            self._publish_map(stamp_s, run)
+        if self._is_due("objects", OBJECTS_S):
+            found = run.objects()
+            if found is not None and found is not self._told:
+                self._told = found
+                self._outputs.objects(stamp_s, found)
+        if self._is_due("grid", GRID_S):
+            self._publish_grid(stamp_s, run)
+
+    def _segment_may_have_changed(self, run: LiveRun) -> None:
+        segment = run.segment()
+        if segment != self._segment:
+            logger.info("map segment %d is the largest now: poses are in its frame", segment)
+            self._segment = segment
+
+    def _is_due(self, name: str, period_s: float) -> bool:
+        now_s = time.monotonic()
+        if now_s < self._due_s[name]:
+            return False
+        self._due_s[name] = now_s + period_s
+        return True
+
+    def _publish_map(self, stamp_s: float, run: LiveRun) -> None:
+        cloud, path = run.map(), run.trajectory().poses_world_camera
+        path = path[:: len(path) // MAX_POSES + 1]
+        best = np.argsort(-cloud.observations, kind="stable")[:MAX_POINTS]
+        self._outputs.map(stamp_s, path, cloud.points_world[best], cloud.colours[best])
+        health = asdict(run.health())
+        counts = health.pop("source")
+        self._outputs.health(stamp_s, health | counts)
+
+    def _publish_grid(self, stamp_s: float, run: LiveRun) -> None:
+        """Let a thread make the grid, unless it still makes the one before."""
+        if self._making is not None:
+            if not self._making.done():
+                return
+            self._due_s["grid"] = max(
+                self._due_s["grid"], time.monotonic() + self._making.result() / GRID_SHARE
+            )
+        self._making = self._thread.submit(self._make_grid, stamp_s, run.keyframe_poses())
+
+    def _make_grid(self, stamp_s: float, poses: dict[int, Array]) -> float:
+        """Make and publish the grid; returns the time of the processor that it took."""
+        begin_s = time.thread_time()
+        found = self._grid.grid(poses)
+        if found is not None:
+            self._outputs.grid(stamp_s, *found)
+        return time.thread_time() - begin_s
+
+
+def _with_low_priority() -> None:
+    """Let tracking come first; Linux knows a priority of each thread."""
+    if hasattr(os, "setpriority"):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)

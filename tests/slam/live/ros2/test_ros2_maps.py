@@ -1,0 +1,184 @@
+"""The grid of a live dense map, objects as markers and detections, and when they are published."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
+
+from test_ros2_sensors import StandIn
+
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, transform
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.labelling.results import LandmarkCloud, MapObjects
+from bmask_slam.live.health import Health
+from bmask_slam.live.ros2 import publisher
+from bmask_slam.live.ros2.dds import typestore
+from bmask_slam.live.ros2.grid import GridOptions, LiveGrid
+from bmask_slam.live.ros2.messages import occupancy_grid
+from bmask_slam.live.ros2.objects import detection_array, marker_array
+from bmask_slam.live.ros2.outputs import OPTICAL, Robot, Ros2Frames
+from bmask_slam.live.ros2.publisher import Ros2Publisher
+from bmask_slam.mapping.products.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from bmask_slam.semantics.labels import LabelSet
+from bmask_slam.semantics.objects.boxes3d import OrientedBox
+from bmask_slam.semantics.objects.publication import MapObject
+from bmask_slam.tracking.results import FrameResult, TrackingStatus
+
+T_MAP_WORLD = make_pose(OPTICAL[:3, :3], np.array([0.0, 0.0, 0.8]))
+
+
+def room(wall_m: float, high_m: float = 1.2) -> np.ndarray:
+    """Floor before a camera 0.8 m high that looks along x, and a wall across; in its frame."""
+    x, y = np.meshgrid(np.arange(0.6, wall_m, 0.02), np.arange(-0.5, 0.5, 0.02))
+    floor = np.stack([x, y, 0 * x], -1).reshape(-1, 3)
+    y, z = np.meshgrid(np.arange(-0.5, 0.5, 0.02), np.arange(0, high_m, 0.02))
+    wall = np.stack([0 * y + wall_m, y, z], -1).reshape(-1, 3)
+    points_map = np.concatenate([floor, wall]) + np.array([0, 0, 0.001])
+    return transform(inverse(T_MAP_WORLD), points_map).astype(np.float32)
+
+
+def at(grid: OccupancyGrid, x: float, y: float) -> int:
+    column, row = np.floor((np.array([x, y]) - grid.origin_m) / grid.resolution_m).astype(int)
+    return int(grid.cells[row, column])
+
+
+@pytest.mark.parametrize("floor_m", [0.0, None])
+def test_floor_is_free_and_the_wall_occupied(floor_m: float | None) -> None:
+    grid = LiveGrid(T_MAP_WORLD, GridOptions(floor_m=floor_m))
+    assert grid.grid({}) is None
+    grid.add(4, room(2.02))
+    found, height_m = grid.grid({4: np.eye(4)})
+    assert height_m == pytest.approx(0, abs=0.02)
+    assert at(found, 1.0, 0.2) == FREE
+    assert at(found, 2.03, 0.2) == OCCUPIED
+    assert at(found, found.origin_m[0] + 0.01, found.origin_m[1] + 0.01) == UNKNOWN
+
+
+def test_submaps_follow_their_keyframes() -> None:
+    """A turn to the left by 90 degrees about the map's z, and 1 m ahead."""
+    options = GridOptions(floor_m=0.0)
+    grid, world = LiveGrid(T_MAP_WORLD, options), se3_exp(np.arange(6.0) / 5)
+    grid.add(4, room(2.02))
+    grid.grid({4: np.eye(4)})
+    turned = se3_exp(np.array([0, 0, np.pi / 2, 1.0 * np.pi / 2, 0, 0]))
+    T = inverse(T_MAP_WORLD) @ turned @ T_MAP_WORLD
+    found, _ = grid.grid({4: T})
+    x, y = turned[:2, :3] @ [2.03, 0.2, 0] + turned[:2, 3]
+    assert at(found, x, y) == OCCUPIED
+    other = LiveGrid(T_MAP_WORLD @ inverse(world), options)  # another world, the same map
+    other.add(4, room(2.02))
+    same, _ = other.grid({4: world @ T})
+    assert np.mean(same.cells == found.cells) > 0.95
+    assert grid.grid({}) is None  # the keyframe was culled
+
+
+def test_what_has_gone_becomes_free() -> None:
+    """A wall that one view saw at 1.5 m, and three others not."""
+    grid = LiveGrid(T_MAP_WORLD, GridOptions(floor_m=0.0))
+    for number, size_m in enumerate(((1.52, 1.2), *3 * [(2.52, 2.0)])):
+        grid.add(number, room(*size_m))
+    found, _ = grid.grid(dict.fromkeys(range(4), np.eye(4)))
+    assert at(found, 1.53, 0.2) == FREE
+    assert at(found, 2.53, 0.2) == OCCUPIED
+
+
+def test_grid_message() -> None:
+    cells = np.array([[0, 100, -1], [1, 2, 3]], np.int8)
+    found = occupancy_grid(1.0, "map", OccupancyGrid(0.05, np.array([-1.0, 2.0]), cells), 0.1)
+    assert (found.info.width, found.info.height, found.info.resolution) == (3, 2, 0.05)
+    origin = found.info.origin.position
+    assert (origin.x, origin.y, origin.z) == (-1.0, 2.0, 0.1)
+    assert found.data.tolist() == [0, 100, -1, 1, 2, 3]
+    name = "nav_msgs/msg/OccupancyGrid"
+    back = typestore().deserialize_cdr(typestore().serialize_cdr(found, name), name)
+    assert back.data.tolist() == found.data.tolist()
+
+
+def some_objects() -> MapObjects:
+    T_map_box = make_pose(np.eye(3), np.array([2.0, 1.0, 0.4]))
+    box = OrientedBox(inverse(T_MAP_WORLD) @ T_map_box, np.array([0.5, 0.6, 0.8]))
+    none = np.zeros(0, np.int64)
+    one = MapObject(7, 2, np.array([0.1, 0.205, 0.69, 0.005]), np.zeros(3), box, none, none, 0, 1)
+    return MapObjects(LabelSet(("background", "cup", "chair", "dog")), [one], np.array([0, -1, 0]))
+
+
+def test_objects_with_the_probabilities_of_labels() -> None:
+    found = detection_array(1.5, "map", some_objects(), T_MAP_WORLD)
+    (one,) = found.detections
+    scores = {r.hypothesis.class_id: r.hypothesis.score for r in one.results}
+    assert scores == {"chair": 0.69, "cup": 0.205, "background": 0.1}
+    assert one.results[0].hypothesis.class_id == "chair"
+    centre, size = one.bbox.center.position, one.bbox.size
+    assert np.allclose([centre.x, centre.y, centre.z], [2, 1, 0.4])
+    assert (size.x, size.y, size.z, one.id) == (0.5, 0.6, 0.8, "7")
+    name = "vision_msgs/msg/Detection3DArray"
+    data = typestore().serialize_cdr(found, name)
+    assert typestore().serialize_cdr(typestore().deserialize_cdr(data, name), name) == data
+
+
+def test_objects_as_markers() -> None:
+    clear, box, label = marker_array(1.5, "map", some_objects(), T_MAP_WORLD).markers
+    assert clear.action == 3
+    assert (box.type, box.ns, box.id, box.scale.z) == (1, "objects", 7, 0.8)
+    assert np.allclose([box.pose.position.x, box.pose.position.z], [2, 0.4])
+    assert (label.type, label.text, label.id) == (9, "chair 0.69", 7)
+    assert label.pose.position.z == pytest.approx(0.4 + 0.4 + 0.1)
+
+
+class Run:
+    """Stands in for a `LiveSlam` with a dense map and a segmenter."""
+
+    def __init__(self) -> None:
+        self.listeners: list[Any] = []
+
+    def map(self) -> LandmarkCloud:
+        one = np.zeros(1, np.int64)
+        return LandmarkCloud(one, np.ones((1, 3)), np.zeros((1, 3), np.uint8), one)
+
+    def trajectory(self) -> Trajectory:
+        return Trajectory(np.ones(1), np.eye(4)[None])
+
+    def health(self) -> Health:
+        return Health(status="OK", source={"late": 1})
+
+    def segment(self) -> int:
+        return 0
+
+    def keyframe_poses(self) -> dict[int, np.ndarray]:
+        return {4: np.eye(4)}
+
+    def objects(self) -> MapObjects:
+        return OBJECTS
+
+    def on_submap(self, listener: Any) -> None:
+        self.listeners.append(listener)
+
+
+OBJECTS = some_objects()
+
+
+def test_maps_are_published_when_they_are_due(monkeypatch) -> None:
+    clock = SimpleNamespace(monotonic=lambda: clock.now_s, thread_time=lambda: 0.0, now_s=0.0)
+    monkeypatch.setattr(publisher, "time", clock)
+    node, run = StandIn(), Run()
+    publish = Ros2Publisher(node, Ros2Frames(), Robot(T_MAP_WORLD, True))
+    for k in range(80):
+        clock.now_s = 100 + k / 10
+        segment = 1 if k == 3 else 0  # of a map that ROS does not know
+        publish(FrameResult(k, 5 + k / 10, TrackingStatus.OK, np.eye(4), segment), run)
+        if k == 0:
+            (add,) = run.listeners
+            add(4, room(2.02))
+    assert publish._making is not None
+    publish._making.result(10)
+    counts = {topic: len(sent) for topic, sent in node.topics.items()}
+    assert counts["/bmask_slam/odometry"] == counts["/bmask_slam/pose"] == 79
+    assert counts["/bmask_slam/path"] == counts["/diagnostics"] == 8
+    assert counts["/bmask_slam/objects"] == counts["/bmask_slam/object_markers"] == 1
+    assert 1 <= counts["/bmask_slam/map"] <= 2
+    assert node.topics["/bmask_slam/map"][-1].info.width > 20

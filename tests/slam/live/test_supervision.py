@@ -1,0 +1,66 @@
+"""A process that hangs is told from one that a busy machine slows down."""
+
+from __future__ import annotations
+
+import os
+from types import SimpleNamespace
+
+import pytest
+from faults import Clock, wait_until
+
+from bmask_slam.live.processes import supervision
+from bmask_slam.live.processes.supervision import RestartPolicy, SupervisedWorker
+from bmask_slam.live.processes.worker import Worker
+
+
+class FakeWorker(SimpleNamespace):
+    """What supervision asks of a process."""
+
+    def __init__(self, name: str, target: str) -> None:
+        super().__init__(is_running=True, processor_s=0.0, pid=0, messages=["answer"])
+        self.kill = lambda: None
+        self.send = lambda message: None
+
+    def receive(self) -> list[str]:
+        return [self.messages.pop()] if self.messages else []
+
+
+@pytest.mark.parametrize(
+    ("silent_s", "used_s", "hangs"),
+    [
+        (19, 0.0, False),
+        (25, 0.0, True),  # stopped, or waits for ever
+        (25, 24.0, True),  # an endless loop
+        (25, 3.0, False),  # it works, but beside many others
+        (190, 15.0, False),
+        (190, 1.0, True),
+        (210, 15.0, True),
+    ],
+)
+def test_silence_counts_by_the_processor_time_that_was_used(
+    monkeypatch: pytest.MonkeyPatch, silent_s: float, used_s: float, hangs: bool
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr(supervision, "time", clock)
+    monkeypatch.setattr(supervision, "Worker", FakeWorker)
+    worker = SupervisedWorker("mapper", "m:f", (), RestartPolicy(answer_s=20.0))
+    assert worker.receive() == ["answer"]
+    worker._worker.processor_s = 7.0
+    worker.send("work", begins=True)
+    worker._worker.processor_s += used_s
+    clock.pass_s(silent_s)
+    assert not worker.restart_if_needed(busy=False)
+    assert worker.restart_if_needed(busy=True) == hangs
+    assert worker.crashes == hangs
+
+
+def test_the_processor_time_of_a_worker_is_the_systems() -> None:
+    worker = Worker("child", "os:getpid")
+    try:
+        wait_until(lambda: worker.processor_s > 0)
+        assert worker.processor_s < 60
+        worker._process.wait()
+    finally:
+        worker.kill()
+    assert os.times().children_user + os.times().children_system > 0
+    assert worker.processor_s == 0

@@ -1,0 +1,105 @@
+"""The film of a run: what is in its pictures, and that it can be played."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from fake_run import FakeSystem, make_sequence
+from PIL import Image
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import make_pose
+from bmask_slam.offline import runner
+from bmask_slam.offline.options import RunOptions
+from bmask_slam.reporting.film import FilmOptions, write_film
+from bmask_slam.reporting.film_cloud import DEPTH_STEP_PX, Shot, make_cloud, sampled_points
+from bmask_slam.reporting.film_view import BACKGROUND, MapPicture, make_view
+
+CAMERA = Camera(64, 48, 60, 60, 31.5, 23.5)
+UP = np.array([0.0, -1.0, 0.0])
+
+
+def shot(number: int, depth_m: np.ndarray, position: tuple[float, float, float]) -> Shot:
+    """A camera that looks along z; its image is red left of the middle and green right of it."""
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[:, :32, 0] = image[:, 32:, 1] = 200
+    T = make_pose(np.eye(3), np.array(position))
+    points, colours = sampled_points(image, depth_m, CAMERA)
+    small = depth_m[::DEPTH_STEP_PX, ::DEPTH_STEP_PX]
+    points = (points + T[:3, 3]).astype(np.float32)
+    return Shot(number, number / 10, image, small, T, points, colours)
+
+
+def wall(z_m: float) -> np.ndarray:
+    return np.full((48, 64), z_m, np.float32)
+
+
+def test_points_appear_with_the_first_shot_that_sees_them_and_what_leaves_is_left_out() -> None:
+    person = wall(2.0)
+    person[16:32, 24:40] = 1.0
+    shots = [shot(0, person, (0, 0, 0)), *(shot(k, wall(2.0), (0, 0, 0)) for k in (1, 2))]
+    shots += [shot(3 + k, wall(2.0), (1.5, 0, 0)) for k in range(2)]  # the other end of the wall
+    cloud = make_cloud(shots, CAMERA, Path("no dense map"))
+    assert np.abs(cloud.points_world[:, 2] - 2.0).max() < 0.03, "the person is gone"
+    x_m = cloud.points_world[:, 0]
+    assert set(cloud.first[x_m > 1.2].tolist()) == {3}
+    behind = (np.abs(x_m) < 0.15) & (np.abs(cloud.points_world[:, 1]) < 0.15)
+    assert set(cloud.first[behind].tolist()) == {1}, "the wall behind the person, when it had left"
+
+
+def test_the_view_shows_left_and_right_and_grows() -> None:
+    shots = [shot(k, wall(2.0), (0, 0, 0)) for k in range(2)]
+    shots += [shot(2 + k, wall(2.0), (1.5, 0, 0)) for k in range(2)]
+    cloud = make_cloud(shots, CAMERA, Path("no dense map"))
+    poses = np.stack([s.T_world_camera for s in shots])
+    view = make_view(cloud, poses, UP, (80, 60))
+    drawn = [MapPicture(view, 0.0, k).image for k in (1, 4)]
+    few, all_of_it = ((image != BACKGROUND).any(axis=2).sum() for image in drawn)
+    assert 0 < few < all_of_it
+    picture = MapPicture(view, 0.0, 4)
+    (left, right, above), ahead = picture.place(np.array([[0, 0, 2.0], [1, 0, 2], [0, -0.5, 2]]))
+    assert ahead.all()
+    assert left[0] < right[0]
+    assert above[1] < left[1], "up in the world is up in the picture"
+    inside = picture.place(poses[:, :3, 3])[0]
+    assert (inside >= 0).all() and (inside < [80, 60]).all(), "the cameras are in the picture"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("film")
+    options = RunOptions(make_sequence(folder / "seq"), out=folder / "run", quiet=True)
+    path = runner.run(options, FakeSystem).folder
+    (path / "graph").unlink()  # the fake one is none; without it the camera is the sequence's
+    return path
+
+
+def test_a_gif_loops_and_has_the_same_bytes_again(run: Path, tmp_path: Path) -> None:
+    options = FilmOptions(run, seconds=1, fps_hz=5, width_px=200)
+    path = write_film(options)
+    assert path == run / "film.gif"
+    with Image.open(path) as film:
+        assert (film.n_frames, film.info["loop"], film.width) == (5, 0, 200)
+    again = write_film(replace(options, out=tmp_path / "again.gif"))
+    assert again.read_bytes() == path.read_bytes()
+
+
+def test_an_mp4_has_its_pictures_and_its_end(run: Path, tmp_path: Path) -> None:
+    path = write_film(FilmOptions(run, tmp_path / "film.mp4", None, 1, 5, 200))
+    assert cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT) == 5 + 2 * 5
+
+
+def test_what_makes_no_film_is_refused(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="unknown kind of film"):
+        FilmOptions(run, tmp_path / "film.avi")
+    with pytest.raises(InputError, match="1 to 120 seconds"):
+        FilmOptions(run, seconds=0.0)
+    with pytest.raises(InputError, match="no such folder for the film"):
+        write_film(FilmOptions(run, tmp_path / "missing" / "film.gif"))
+    with pytest.raises(InputError, match="no such list"):
+        write_film(FilmOptions(run, sequence=tmp_path))

@@ -1,0 +1,113 @@
+"""The page about a run: what is in it, hostile names, broken and missing files."""
+
+from __future__ import annotations
+
+import html.parser
+import json
+import re
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from fake_run import FakeSystem, make_sequence
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.offline import runner
+from bmask_slam.offline.options import RunOptions
+from bmask_slam.reporting.run_report import write_run_report
+
+HOSTILE = "<script>alert(1)</script> & 'x' \"y\""
+WARNING = f"2026-01-01 10:00:00,000 WARNING bmask_slam.x: depth {HOSTILE}\n"
+
+
+def hostile_object(number: int) -> dict[str, object]:
+    box = {"centre_world_m": [1, 2, 3], "axes_world": np.eye(3).tolist(), "size_m": [0.5, 1, 2]}
+    return {
+        "id": number, "label": HOSTILE, "probability": 0.75, "distribution": {HOSTILE: 0.75},
+        "centroid_world_m": [1, 2, 3], "box": box, "keyframes": [0, 1], "landmarks": [],
+        "first_seen_s": 0.0, "last_seen_s": 1.0,
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the fake system, frames 6 and 13 lost, with objects, in a folder of a bad name."""
+    folder = tmp_path_factory.mktemp("report")
+    out = folder / HOSTILE.replace("/", "-")
+    runner.run(RunOptions(make_sequence(folder / "seq"), out=out, quiet=True), FakeSystem)
+    with (out / "log.txt").open("a", encoding="utf-8") as log:
+        log.write(2 * WARNING)
+    content = {"labels": [HOSTILE], "up_world": [0, -1, 0], "floor_m": None}
+    text = json.dumps(content | {"objects": [hostile_object(k) for k in (3, 4)]})
+    (out / "objects.json").write_text(text, encoding="utf-8")
+    cv2.imwrite(str(out / "objects.png"), np.full((90, 2400, 3), 7, np.uint8))
+    return out
+
+
+@pytest.fixture(scope="module")
+def written(run: Path) -> Path:
+    return write_run_report(run)
+
+
+class Page(html.parser.HTMLParser):
+    """Tags, addresses, headings and words of a page."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.words: list[str] = []
+        self.feed(path.read_text(encoding="utf-8"))
+        self.text = " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.addresses += [value for name, value in attrs if name in ("src", "href") and value]
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+def test_the_page_has_the_figures_the_warnings_and_the_files(written: Path) -> None:
+    page = Page(written)
+    assert "tracked 90.0 %" in page.text
+    assert "frames LOST 2" in page.text
+    assert f"depth {HOSTILE} (2 times)" in page.text
+    assert f"{HOSTILE} 3 75 0.50 × 1.00 × 2.00 1.00, 2.00, 3.00 2" in page.text
+    assert "T_world_camera of every tracked frame" in page.text
+    assert page.tags.count("img") == 5, "path, errors, features, times, objects.png"
+
+
+def test_the_page_is_one_file_and_every_text_is_escaped(written: Path) -> None:
+    page = Page(written)
+    assert "script" not in page.tags
+    assert all(address.startswith(("data:", "#")) for address in page.addresses)
+    svg = re.findall(r'src="(data:image/svg[^"]+)"', written.read_text())
+    assert len(svg) == 4
+
+
+def test_the_same_run_gives_the_same_bytes_elsewhere(run, written, tmp_path) -> None:
+    other = write_run_report(run, tmp_path / "a.html")
+    assert other.read_bytes() == written.read_bytes()
+
+
+def test_what_is_broken_is_named_and_what_is_missing_left_out(run: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    for name in ("metrics.json", "trajectory.txt", "objects.png"):
+        (copy / name).write_text("no such thing")
+    for name in ("frames.csv", "events.csv", "config.yaml"):
+        (copy / name).unlink()
+    page = Page(write_run_report(copy))
+    for name in ("metrics.json", "trajectory.txt", "objects.png"):
+        assert re.search(rf"copy/{re.escape(name)}\S*: ", page.text), name
+    assert page.tags.count("img") == 0
+
+
+def test_no_run_and_no_folder_are_refused(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no run"):
+        write_run_report(tmp_path)
+    with pytest.raises(InputError, match="no such folder for the report"):
+        write_run_report(run, tmp_path / "missing" / "page.html")
