@@ -251,7 +251,8 @@ class MovingObjectFilter:
     ) -> tuple[Mask, list[Track | None]]:
         """Which of a keyframe's sightings (K,) move, by their tracks, if they have one; these.
 
-        A culled keyframe, whose time ``now_s`` is NaN, adds nothing to the tracks.
+        A culled keyframe, whose time ``now_s`` is NaN, adds nothing to the tracks, nor does one
+        whose masks come after those of a newer one: its process may have been started again.
         """
         moving = np.array([s is not None and s.log_odds > 0 for s in sightings], bool)
         tracks: list[Track | None] = [None] * len(sightings)
@@ -260,6 +261,8 @@ class MovingObjectFilter:
         least = log_odds(self.config.tracks.min_prior)
         movable = {k: s for k, s in enumerate(sightings) if s is not None and s.log_odds > least}
         ids = self.tracks.update(now_s, list(movable.values()), masks.T_world_camera[:3, :3])
+        if len(ids) < len(movable):
+            return moving, tracks
         ahead = [self.tracks.predicted(track, now_s) for track in self.tracks.tracks]
         by_id = {track.id: track for track in ahead}
         for k, track_id in zip(movable, ids, strict=True):

@@ -13,6 +13,7 @@ from bmask_slam.config.configuration import resolve
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
+from bmask_slam.moving.keyframe_masks import KeyframeMasks
 from bmask_slam.moving.static_features import StaticFeatures
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.labels import label_set
@@ -271,6 +272,21 @@ def test_a_late_mask_removes_added_observations(frames: list[Frame]) -> None:
     assert before > 50
     assert landmarks_on_card(system) < 0.05 * before
     assert len(system.mapper.smoother.estimate().landmark_ids) < in_graph
+
+
+def test_masks_that_come_again_after_newer_ones_are_used(frames: list[Frame]) -> None:
+    """A segmentation process that was started again repeats what it had not confirmed."""
+    system = SlamSystem(CAMERA, resolve(SystemConfig, None, SETTINGS), CardSegmenter(1))
+    seen: list[KeyframeMasks] = []
+    observe = system.moving_objects.observe_masks
+    system.semantics._on_masks = lambda masks: (seen.append(masks), observe(masks))[1]
+    for frame in frames[:8]:
+        system.process(frame)
+    tracks = system.moving_objects.tracks.tracks
+    assert len(seen) > 1
+    observe(seen[0])
+    assert system.moving_objects.tracks.tracks == tracks
+    assert landmarks_on_card(system) < 5
 
 
 def test_a_static_scene_is_used_completely() -> None:
