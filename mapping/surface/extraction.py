@@ -69,19 +69,38 @@ NOTHING = Surface(_ROWS, _ROWS, _ROWS.astype(np.uint8), _NONE, _NONE, _ROWS.asty
 
 def extract(volume: SurfaceVolume, min_witnesses: float = MIN_WITNESSES) -> Surface:
     """The surface of a volume, with all its components; every vertex is in a triangle."""
-    index = block_indices(torch.from_numpy(np.sort(volume.keys))).numpy()
-    places = np.argsort(volume.keys)
-    if not len(places):
+    return extract_blocks(volume, SortedBlocks.of(volume), min_witnesses)
+
+
+def extract_blocks(
+    volume: SurfaceVolume,
+    blocks: SortedBlocks,
+    min_witnesses: float,
+    chosen: Ints | None = None,
+    bounds: tuple[Ints, Ints] | None = None,
+) -> Surface:
+    """The surface in the ``chosen`` blocks (N,), rows of ``blocks``; None: in all.
+
+    Of these only the triangles that begin in cells from an index (3,) up to another; None: all.
+    """
+    chosen = np.arange(len(blocks.places)) if chosen is None else chosen
+    if not len(chosen):
         return NOTHING
     parts = [
         _vertices(cells, volume.voxel_m)
-        for cells in _blocks_with_halo(volume, index, places, min_witnesses)
+        for cells in _blocks_with_halo(volume, blocks, chosen, min_witnesses)
     ]
     rows = [np.concatenate(part) for part in zip(*parts, strict=True)]
     order = np.argsort(rows[4])
     points, colours, weights, views, keys, crossings = (row[order] for row in rows)
+    if not len(keys):
+        return NOTHING
     triangles = _triangles(keys, crossings)
     normals = _normals(points, triangles)
+    if bounds is not None:
+        cell = block_indices(torch.from_numpy(keys)).numpy()
+        crossings[((cell < bounds[0]) | (cell >= bounds[1])).any(axis=1)] = 0
+        triangles = _triangles(keys, crossings)
     found = Surface(points, normals, colours, weights, views, triangles)
     found = found.select(found.views >= min_witnesses)
     return found.select(_used(found))
@@ -106,6 +125,20 @@ def _used(surface: Surface) -> Mask:
 
 
 @dataclass(frozen=True, eq=False)
+class SortedBlocks:
+    """Blocks of a volume by key: ``index`` (B, 3), and their ``places`` (B,) in the tables."""
+
+    index: Ints
+    places: Ints
+
+    @classmethod
+    def of(cls, volume: SurfaceVolume) -> SortedBlocks:
+        keys = volume.keys
+        places = np.argsort(keys)
+        return cls(block_indices(torch.from_numpy(keys[places])).numpy(), places)
+
+
+@dataclass(frozen=True, eq=False)
 class _Cells:
     """Values at the voxels of blocks and of the next ones beside them, (B, 9, 9, 9).
 
@@ -122,12 +155,12 @@ class _Cells:
 
 
 def _blocks_with_halo(
-    volume: SurfaceVolume, index: Ints, places: Ints, min_witnesses: float
+    volume: SurfaceVolume, blocks: SortedBlocks, chosen: Ints, min_witnesses: float
 ) -> Iterator[_Cells]:
-    """The blocks with indices (B, 3), some at a time; ``places`` are those in the tables."""
-    keys = block_keys(torch.from_numpy(index)).numpy()
-    for start in range(0, len(index), AT_ONCE):
-        some = index[start : start + AT_ONCE]
+    """The ``chosen`` blocks (N,), some at a time."""
+    places, keys = blocks.places, block_keys(torch.from_numpy(blocks.index)).numpy()
+    for start in range(0, len(chosen), AT_ONCE):
+        some = blocks.index[chosen[start : start + AT_ONCE]]
         shape = (len(some), *(EDGE + 1,) * 3)
         unknown = np.full(shape, np.nan, np.float32)
         weight, witnesses = np.zeros(shape, np.float32), np.zeros(shape, np.float32)

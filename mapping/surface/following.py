@@ -72,11 +72,13 @@ class FollowingSurface:
 
     Attributes:
         volume: of the frames.
+        stale: blocks (B,) of an unfinished ``following``, which lack frames; else none.
     """
 
     def __init__(self, volume: SurfaceVolume, load: LoadFrame) -> None:
         self.volume, self._load = volume, load
         self._parts: dict[int, _Part] = {}
+        self._changed = self.stale = torch.zeros(0, dtype=torch.bool)
 
     def __len__(self) -> int:
         return len(self._parts)
@@ -86,7 +88,20 @@ class FollowingSurface:
 
     def add(self, number: int, frame: DepthFrame) -> None:
         """Integrate a frame that is not in it yet. Raises InputError: the disk is full."""
-        self._parts[number] = _Part.of(frame.T_world_camera, self.volume.integrate(frame))
+        blocks = self.volume.integrate(frame)
+        self._parts[number] = _Part.of(frame.T_world_camera, blocks)
+        self._changed = _grown(self._changed, len(self.volume))
+        self._changed[torch.from_numpy(blocks)] = True
+
+    def take_changed(self) -> Ints:
+        """Keys (N,) of the blocks that have changed since the last call."""
+        rows = torch.nonzero(self._changed)[:, 0].numpy()
+        self._changed = torch.zeros(len(self.volume), dtype=torch.bool)
+        return self.volume.keys[rows]
+
+    def moved(self, poses: Mapping[int, Array]) -> set[int]:
+        """Which frames are in it by more than a voxel from these poses T_world_camera (4, 4)."""
+        return {n for n, T in poses.items() if n in self._parts and self._has_moved(n, T)}
 
     def follow(
         self,
@@ -104,18 +119,34 @@ class FollowingSurface:
         Raises:
             InputError: a frame cannot be read, or the disk is full.
         """
+        read = 0
+        for done, was_read in self.following(poses, removed):
+            progress(done)
+            read += was_read
+        return read
+
+    def following(
+        self,
+        poses: Mapping[int, Array],
+        removed: Collection[int] = (),
+        changed: Collection[int] = (),
+    ) -> Iterator[tuple[int, bool]]:
+        """``follow`` in steps of at most one frame: how many were looked at, whether it was read.
+
+        Frames that were ``changed`` are taken as moved. Between the steps other frames may be
+        added; until the last one ``stale`` blocks are not complete, and it must not begin anew.
+        """
         gone = [n for n in removed if n in self._parts]
         known = {n: T for n, T in poses.items() if n in self._parts and n not in gone}
-        moved = {n: T for n, T in known.items() if self._has_moved(n, T)}
+        moved = {n: T for n, T in known.items() if n in changed or self._has_moved(n, T)}
         if not moved and not gone:
-            return 0
-        stale = self._cleared((*moved, *gone))
+            return
+        self._clear((*moved, *gone))
         for number in gone:
             del self._parts[number]
-        read = 0
         for done, (number, part) in enumerate(list(self._parts.items())):
-            progress(done)
-            if number not in moved and not part.on(stale):
+            if number not in moved and not part.on(self.stale):
+                yield done, False
                 continue
             frame = self._load(number, moved.get(number, part.T_world_camera))
             if frame is None:
@@ -123,19 +154,18 @@ class FollowingSurface:
             elif number in moved:
                 self.add(number, frame)
             else:
-                grown = len(self.volume) - len(stale)  # blocks made by frames that moved
-                stale = torch.nn.functional.pad(stale, (0, grown))
-                self.volume.integrate(frame, stale)
-            read += 1
-        return read
+                self.stale = _grown(self.stale, len(self.volume))  # by frames that moved
+                self.volume.integrate(frame, self.stale)
+            yield done, True
+        self.stale = torch.zeros(0, dtype=torch.bool)
 
-    def _cleared(self, numbers: Collection[int]) -> Tensor:
-        """Clear the blocks that some frames changed; returns which they are (B,)."""
-        stale = torch.zeros(len(self.volume), dtype=torch.bool)
+    def _clear(self, numbers: Collection[int]) -> None:
+        """Clear the blocks that some frames changed, which are stale from here on."""
+        self.stale = torch.zeros(len(self.volume), dtype=torch.bool)
         for number in numbers:
-            self._parts[number].mark(stale)
-        self.volume.clear(stale)
-        return stale
+            self._parts[number].mark(self.stale)
+        self.volume.clear(self.stale)
+        self._changed = _grown(self._changed, len(self.volume)) | self.stale
 
     def _has_moved(self, number: int, T_world_camera: Array) -> bool:
         was = self._parts[number].T_world_camera
@@ -201,6 +231,11 @@ def _are_packed(arrays: Arrays) -> bool:
         if len(bits) > most or not unpacker.eof:
             return False
     return True
+
+
+def _grown(marks: Tensor, size: int) -> Tensor:
+    """Marks (B,) of more blocks, the new ones not marked."""
+    return torch.nn.functional.pad(marks, (0, size - len(marks)))
 
 
 def displacement_m(T_world_a: Array, T_world_b: Array) -> float:

@@ -58,6 +58,14 @@ class KeyframeSurface:
         self._cubes = torch.split(torch.from_numpy(points_world[order]), counts.tolist())
         self._centres: Array = (cubes + 0.5) * CUBE_M
         self._camera = camera
+        self._all: Tensor | None = None
+
+    @classmethod
+    def near(cls, points_world: Floats, camera: Camera) -> KeyframeSurface:
+        """One of points (N, 3) that all are near what is judged: they are not sorted."""
+        found = cls(points_world[:0], camera)
+        found._all = torch.from_numpy(points_world)
+        return found
 
     def judge(self, depth_m: Floats, T_world_camera: Array) -> Judgement:
         """Compare a frame's depth (H, W) with the surface as it looks from there."""
@@ -120,6 +128,8 @@ class KeyframeSurface:
 
     def _visible(self, T_camera_world: Array) -> Tensor:
         """The points (N, 3) of the cubes that are in the image."""
+        if self._all is not None:
+            return self._all
         camera = self._camera
         x, y, z = (self._centres @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]).T
         depth = np.maximum(z, NEAREST_M)

@@ -66,6 +66,8 @@ def add_live(commands: Commands) -> None:
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
     parser.add_argument("--map", action="store_true", help="also a dense map, as by bmask-slam map")
     add_mesh_voxel_argument(parser)
+    text = "with --map: at most N frames a second between keyframes go into it (default: 5)"
+    parser.add_argument("--map-frames", type=float, metavar="N", default=5.0, help=text)
     add_segmenter_arguments(parser, "light")
     parser.add_argument("--view", action="store_true", help="show it in Rerun's window")
     add_view_arguments(parser)
@@ -198,6 +200,7 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
     from bmask_slam.live.live_slam import LiveOptions
     from bmask_slam.live.ros2.grid import POINTS
     from bmask_slam.live.sources.opening import ros2_of
+    from bmask_slam.live.start import frames_a_second
     from bmask_slam.run_folder.open_files import free_run_path
     from bmask_slam.sequences.bags.bag_file import is_bag
     from bmask_slam.sequences.formats.layouts import is_recording_file
@@ -215,6 +218,7 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
         title=source.name,
         dense=arguments.map,
         mesh_voxel_m=arguments.mesh_voxel_m,
+        surface_frames=frames_a_second(arguments.map_frames) if arguments.map else None,
         submap_points=POINTS if ros2_of(source) is not None else 0,
         calibrate=arguments.calibrate,
         straightens=True,
@@ -228,7 +232,10 @@ def _summary(slam: LiveSlam, source: Source) -> str:
         lines.append(f"\nCamera      {slam.calibration}")
     lines.append(f"\nRun folder  {slam.out}")
     if slam.dense is not None:
-        lines.append(f"Dense map   {slam.out}/dense, {slam.dense.points} points")
+        lines.append(
+            f"Dense map   {slam.out}/dense, {slam.dense.points} points"
+            f", {slam.dense.frames} frames besides keyframes"
+        )
     if counts := source.counts.line():
         lines.append(f"Source      {counts}")
     return "\n".join(lines)

@@ -10,6 +10,7 @@ cloud.ply, .pcd     the cloud, with normals, label, probability and sigma of eac
 semantic.ply, .pcd  the same in the colours of the labels, if there are labels
 objects/ID-CLASS    a cloud of each object of the run
 moving/ID, .ply     with --moving: excluded points of each keyframe, and the cloud of all of them
+frames/             while `live --map` runs: frames between keyframes, for the growing surface
 volume/             with --keep-volume: the surface's voxels, and which frames are in them
 mesh.ply, .glb      the mesh, with the same columns; for viewers
 plan.png            the map from above
@@ -60,7 +61,7 @@ _NO_EVIDENCE = InstanceEvidence(
 )
 NewIds = Callable[[Ints], Ints]
 PARTS = ("depth", "colours", "moving", "labels")
-OLD_PARTS = ("submaps", "volume")
+OLD_PARTS = ("submaps", "volume", "frames")
 METHOD = 4
 """Version of the method; to be raised when the same settings give other submaps than before."""
 
@@ -188,6 +189,11 @@ class DenseFolder:
     def is_done(self, keyframe_id: int) -> bool:
         """Whether the keyframe is finished, and its depth still there."""
         return all(self._file(kind, keyframe_id).is_file() for kind in ("labels", "depth"))
+
+    def finished(self) -> list[int]:
+        """Ids of the finished keyframes."""
+        ids = (int(path.name) for path in (self.path / "labels").glob("[0-9]*[0-9]"))
+        return sorted(number for number in ids if self.is_done(number))
 
     def write(self, result: FusedKeyframe, evidence: InstanceEvidence) -> None:
         """Save a finished keyframe. Raises InputError, with no half-written file, if it cannot."""

@@ -47,6 +47,20 @@ OVERVIEW_TILT_DEG = -20.0
 """The overview is taken from behind and above a keyframe, tilted down."""
 
 
+@dataclass(frozen=True, eq=False)
+class GrownSurface:
+    """A surface.
+
+    Attributes:
+        frames: in it, besides keyframes.
+        alike: so many frames, one after the other, have the same errors; at least 1.
+    """
+
+    surface: Surface
+    frames: int
+    alike: float
+
+
 @dataclass(frozen=True)
 class Products:
     """What was written.
@@ -63,16 +77,23 @@ class Products:
 
 
 def write_products(
-    fused: FusedMap, progress: Callable[[int, int], None] = lambda done, total: None
+    fused: FusedMap,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    grown: GrownSurface | None = None,
 ) -> Products:
-    """Make the surface and write the clouds, mesh, plan and pictures of it."""
-    surface, evidence = make_surface(fused, progress), KeyframeEvidence(fused)
+    """Write the clouds, mesh, plan and pictures of the surface, which is made if it is not given.
+
+    Raises:
+        InputError: nothing can be seen of it, or the disk is full.
+    """
+    grown = grown or GrownSurface(make_surface(fused, progress), 0, frames_a_keyframe(fused))
+    surface, evidence = grown.surface, KeyframeEvidence(fused)
     if not len(surface.vertices):
         raise InputError(f"{fused.run.path}: no surface: too few keyframes have depth")
     views = evidence.views(surface.vertices)
     up_guess = -np.mean([k.T_world_camera[:3, 1] for k in evidence.keyframes], axis=0)
     table = evidence.table(evidence.ground(surface, views, up_guess))
-    cloud = _labelled(surface, views, table, frames_a_keyframe(fused))
+    cloud = _labelled(surface, views, table, grown.alike)
     kept = ~np.isin(cloud.labels, [fused.labels.number(n) for n in fused.options.excluded or ()])
     surface, cloud = surface.select(kept), cloud.select(kept)
     if not len(cloud):

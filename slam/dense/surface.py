@@ -16,7 +16,8 @@ from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.keyframe_input import MAX_STAMP_ERROR_S, undistort_images
 from bmask_slam.dense.options import MapOptions, fusion_config
 from bmask_slam.dense.saved_map import MappedRun, SavedMap
-from bmask_slam.graph.arrays import Array, Arrays, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.trajectory import nearest_indices, read_tum
@@ -37,6 +38,7 @@ from bmask_slam.mapping.surface.volume import SurfaceVolume
 from bmask_slam.run_folder.frame_file import FRAMES, read_frames
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.torch_threads import one_thread
+from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.results import TrackingStatus
 from bmask_slam.world.world_map import Keyframe
 
@@ -137,14 +139,12 @@ class _SurfaceMaker:
 
     def _views(self) -> Iterator[DepthView]:
         """The fused depth of the keyframes, oldest first, without what is beside cut-out masks."""
-        folder = self._fused.folder
         numbers = [self._fused.labels.number(n) for n in self._fused.options.excluded or ()]
         for keyframe in self._keyframes.values():
-            evidence = folder.evidence(keyframe.id)
-            of_excluded = np.isin(evidence.log_likelihoods.argmax(axis=1), numbers)
-            cut_out = np.isin(evidence.pixels, np.flatnonzero(of_excluded))
-            depth = folder.fused(keyframe.id).without(dilate(cut_out, BESIDE_PX))
-            yield depth.depth_m(), keyframe.T_world_camera
+            yield (
+                unmasked_depth_m(self._fused.folder, keyframe.id, numbers),
+                keyframe.T_world_camera,
+            )
 
     def _volume(self, folder: Path | None = None, kept: Ints | None = None) -> SurfaceVolume:
         folder = self._fused.folder.path if folder is None else folder
@@ -166,16 +166,9 @@ class _SurfaceMaker:
         return self._frame(number, T_world_camera)
 
     def _keyframe(self, number: int, T_world_camera: Array) -> DepthFrame:
-        fused, number = self._fused, -1 - number
-        folder, camera = fused.folder, fused.run.camera
-        depth, rgb = folder.fused(number), folder.colours(number)
-        pixels = folder.evidence(number).pixels
-        if {depth.rho.shape, rgb.shape[:2], pixels.shape} != {(camera.height, camera.width)}:
-            raise InputError(
-                f"{folder.path}: the images of keyframe {number} are not of the camera's size; "
-                "remove the folder and map again"
-            )
-        return depth_frame(depth, rgb, T_world_camera, camera, fused.options.surface_voxel_m)
+        fused = self._fused
+        camera, voxel_m = fused.run.camera, fused.options.surface_voxel_m
+        return keyframe_as_frame(fused.folder, -1 - number, T_world_camera, camera, voxel_m)
 
     def _prepared(self, frames: dict[int, Array]) -> Iterator[tuple[int, DepthFrame | None]]:
         """The frames in order, some prepared ahead by a second thread."""
@@ -194,16 +187,46 @@ class _SurfaceMaker:
         assert isinstance(run, MappedRun)
         assert self._gate is not None
         try:
-            rgb, depth_m = undistort_images(run.sequence.load(index), run.camera)
+            images = run.sequence.load(index)
         except InputError as error:
             logger.warning("%s; not in the surface", error)
             return None
-        measured = regularise(from_sensor(depth_m, run.camera, fusion_config(options).measurement))
-        verdict = self._gate.judge(measured.depth_m(), T_world_camera)
-        measured = measured.without(verdict.in_front)
-        frame = depth_frame(measured, rgb, T_world_camera, run.camera, options.surface_voxel_m)
-        mark_unexplained(frame, verdict.unexplained)
-        return frame
+        return gated_frame(images, T_world_camera, self._gate, run.camera, options)
+
+
+def keyframe_as_frame(
+    folder: DenseFolder, keyframe_id: int, T_world_camera: Array, camera: Camera, voxel_m: float
+) -> DepthFrame:
+    """A fused keyframe for a volume. Raises InputError: its images cannot be used."""
+    depth, rgb = folder.fused(keyframe_id), folder.colours(keyframe_id)
+    pixels = folder.evidence(keyframe_id).pixels
+    if {depth.rho.shape, rgb.shape[:2], pixels.shape} != {(camera.height, camera.width)}:
+        raise InputError(
+            f"{folder.path}: the images of keyframe {keyframe_id} are not of the camera's size; "
+            "remove the folder and map again"
+        )
+    return depth_frame(depth, rgb, T_world_camera, camera, voxel_m)
+
+
+def gated_frame(
+    images: Frame, T_world_camera: Array, gate: KeyframeSurface, camera: Camera, options: MapOptions
+) -> DepthFrame:
+    """A frame, distorted, for a volume: after Step 3, without what the gate refuses."""
+    rgb, depth_m = undistort_images(images, camera)
+    measured = regularise(from_sensor(depth_m, camera, fusion_config(options).measurement))
+    verdict = gate.judge(measured.depth_m(), T_world_camera)
+    measured = measured.without(verdict.in_front)
+    frame = depth_frame(measured, rgb, T_world_camera, camera, options.surface_voxel_m)
+    mark_unexplained(frame, verdict.unexplained)
+    return frame
+
+
+def unmasked_depth_m(folder: DenseFolder, keyframe_id: int, excluded: list[int]) -> Floats:
+    """The fused depth (H, W) of a keyframe without what is beside instances of these classes."""
+    evidence = folder.evidence(keyframe_id)
+    of_excluded = np.isin(evidence.log_likelihoods.argmax(axis=1), excluded)
+    cut_out = np.isin(evidence.pixels, np.flatnonzero(of_excluded))
+    return folder.fused(keyframe_id).without(dilate(cut_out, BESIDE_PX)).depth_m()
 
 
 def read_or_clear(folder: Path, made_of: dict[str, Any]) -> Arrays | None:

@@ -21,6 +21,8 @@ IMAGE_EVERY = 3
 """Interval in frames of images that are shown."""
 MOVED_AT_ONCE = 10
 """Largest number of submaps that are moved at a frame; the others follow at the next frames."""
+PARTS_AT_ONCE = 1
+"""Largest number of parts of the surface that are shown at a frame."""
 MOVED_M, TURNED = 0.002, 0.001
 """Smallest shift in metres, and change of the rotation matrix, for which a submap is moved."""
 
@@ -42,6 +44,7 @@ class Display:
         self._changes = system.remote.changes
         if system.dense is not None:
             self.submaps(system.dense, system.remote.world, has_changed, MOVED_AT_ONCE)
+            self.surface(system.dense, PARTS_AT_ONCE)
         return has_changed
 
     def map(self, system: LiveSystem, health: Health) -> None:
@@ -52,6 +55,11 @@ class Display:
         self._scene.log_points("world/keyframes", path, colours, 0.02)
         numbers = {k: v for k, v in asdict(health).items() if isinstance(v, int | float)}
         self._scene.log_numbers("health", numbers)
+
+    def surface(self, dense: RemoteDenseMapper, at_once: int) -> None:
+        """Show at most so many parts of the surface that have changed."""
+        for region in list(dense.shown.parts)[:at_once]:
+            self._scene.log_surface_part(dense.shown.parts.pop(region))
 
     def submaps(
         self, dense: RemoteDenseMapper, world: WorldMap, has_changed: bool, at_once: int

@@ -29,6 +29,7 @@ class Health:
         latency_ms_median, latency_ms_p95: from handing a frame in to its result.
         keyframes, landmarks, loops_closed: in the map.
         submaps: in the dense map.
+        surface_frames: in its surface besides keyframes.
         keyframes_waiting: for the map's process.
         masks_waiting: keyframes that wait for the segmenter's process.
         submaps_waiting: keyframes that wait for the dense map's process.
@@ -36,6 +37,7 @@ class Health:
         frames_refused: that were broken, or not later than the one before.
         masks_dropped: keyframes that the segmenter skipped.
         submaps_dropped: keyframes that the dense map skipped.
+        surface_frames_dropped: that were due for the surface while it was behind.
         unwritten: how often something could not be written, as on a full disk.
         lost_frames: without a pose.
         lost_episodes: how often tracking was lost.
@@ -53,6 +55,7 @@ class Health:
     landmarks: int = 0
     loops_closed: int = 0
     submaps: int = 0
+    surface_frames: int = 0
     keyframes_waiting: int = 0
     masks_waiting: int = 0
     submaps_waiting: int = 0
@@ -60,6 +63,7 @@ class Health:
     frames_refused: int = 0
     masks_dropped: int = 0
     submaps_dropped: int = 0
+    surface_frames_dropped: int = 0
     unwritten: int = 0
     lost_frames: int = 0
     lost_episodes: int = 0
@@ -151,6 +155,7 @@ def measure_health(
         landmarks=int(remote.world.landmarks.in_map.sum()),
         loops_closed=remote.loops_closed,
         submaps=len(dense.submaps) if dense else 0,
+        surface_frames=dense.frames.integrated if dense else 0,
         keyframes_waiting=remote.pending,
         masks_waiting=segmenter.waiting if segmenter else 0,
         submaps_waiting=dense.waiting if dense else 0,
@@ -158,7 +163,8 @@ def measure_health(
         frames_refused=meter.refused,
         masks_dropped=segmenter.dropped if segmenter else 0,
         submaps_dropped=dense.dropped if dense else 0,
-        unwritten=unwritten + (dense.unwritten if dense else 0),
+        surface_frames_dropped=dense.frames.dropped if dense else 0,
+        unwritten=unwritten + (dense.unwritten + dense.frames.unwritten if dense else 0),
         lost_frames=meter.lost_frames,
         lost_episodes=meter.lost_episodes,
         map_deaths=remote.worker.crashes,

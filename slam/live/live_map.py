@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bmask_slam.graph.arrays import Array, Floats
 from bmask_slam.graph.errors import InputError
@@ -16,6 +16,9 @@ from bmask_slam.live.messages import MapSaved, SaveMap
 from bmask_slam.live.start import LiveOptions
 from bmask_slam.live.system import LiveSystem
 from bmask_slam.sensor_input import SensorInput
+
+if TYPE_CHECKING:  # it loads torch
+    from bmask_slam.mapping.surface.parts import SurfacePart
 
 MAX_MAP_WAIT_S = 1.0
 """Longest time that one call of ``catch_up`` waits for the map."""
@@ -94,6 +97,15 @@ class LiveMap(SensorInput):
         if dense is not None:
             dense.listeners.append(listener)
             dense.keeps_previews = self.options.view.enabled
+
+    def on_surface(self, listener: Callable[[SurfacePart], None]) -> None:
+        """Call with each part of the dense map's growing surface that has changed, a few a second.
+
+        A part replaces what came before of its region; it has one vertex in a cell of two voxels,
+        in the world of the largest map segment. Nothing is called without a dense map.
+        """
+        if self._system.dense is not None:
+            self._system.dense.show_surface(listener)
 
     @property
     def extends(self) -> bool:

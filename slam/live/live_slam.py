@@ -245,9 +245,11 @@ class LiveSlam(LiveMap):
         """Let the dense map's process finish, and log which keyframes are missing."""
         world = self._system.mapper.world
         dense.follow(folder.path)
-        self.dense = dense.finish(world, DENSE_FINISH_S)
+        self.dense = dense.finish(world, self._system.map.history, DENSE_FINISH_S)
         if self._display is not None:
             self._display.submaps(dense, world, True, len(world.keyframes))
+            self._display.surface(dense, len(dense.shown.parts))
         self.dense.log_missing(folder.path, self.options.images is not None)
-        ended = replace(health, submaps=len(dense.submaps), submaps_waiting=0)
+        made_of = len(dense.submaps), self.dense.frames
+        ended = replace(health, submaps=made_of[0], surface_frames=made_of[1], submaps_waiting=0)
         folder.write_text(HEALTH, ended.as_json())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +24,7 @@ from bmask_slam.system_config import SystemConfig
 from bmask_slam.viewer.scene import ViewOptions
 
 if TYPE_CHECKING:
+    from bmask_slam.dense.growing.frames import FrameOptions
     from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 
 PREVIEW_POINTS = 3000
@@ -44,6 +45,8 @@ class LiveOptions:
         title: of the plot of the trajectory.
         dense: make a dense map as well; needs ``out``.
         mesh_voxel_m: edge of its voxels, for a preview; None: 0.01.
+        surface_frames: which tracked frames are in the dense map besides keyframes; None:
+            five a second.
         submap_points: number of points of each submap that `LiveSlam.on_submap` gives.
         calibrate: whether readout time, depth delay and bend of depth are found while it runs:
             ``auto`` uses what is found, ``report`` only says so, ``off``.
@@ -61,6 +64,7 @@ class LiveOptions:
     title: str = "live"
     dense: bool = False
     mesh_voxel_m: float | None = None
+    surface_frames: FrameOptions | None = None
     submap_points: int = 0
     calibrate: str = "off"
     straightens: bool = False
@@ -90,6 +94,13 @@ def start_calibration(
     return RemoteCalibration(setup)
 
 
+def frames_a_second(most: float) -> FrameOptions:
+    """At most so many frames for the dense map's surface. Raises InputError: it is negative."""
+    from bmask_slam.dense.growing.frames import FrameOptions  # noqa: PLC0415 - loads torch
+
+    return FrameOptions(most)
+
+
 def start_dense(
     out: Path, camera: Camera, options: LiveOptions, masks: SegmenterOptions, labels: LabelSet
 ) -> RemoteDenseMapper:
@@ -98,7 +109,12 @@ def start_dense(
 
     points = max(PREVIEW_POINTS if options.view.enabled else 0, options.submap_points)
     setup = remote_dense.DenseSetup(out, camera, masks, labels.names, points, options.mesh_voxel_m)
-    return remote_dense.RemoteDenseMapper(setup)
+    if options.surface_frames is not None:
+        setup = replace(setup, frames=options.surface_frames)
+    dense = remote_dense.RemoteDenseMapper(setup)
+    if options.view.enabled:
+        dense.show_surface()
+    return dense
 
 
 def start_system(

@@ -191,6 +191,7 @@ class LiveSystem(SlamSystem):
         remote, segmenter = self.remote, self.segmenter
         if moved:
             dense.remove_culled(remote.world, remote.awaits)
+        dense.place(remote.world, remote.history, moved)
         lacks = segmenter.awaits if segmenter is not None else (lambda number: False)
         dense.update(remote.world, remote.awaits, lacks)
 
@@ -229,6 +230,9 @@ class LiveSystem(SlamSystem):
     ) -> Array | None:
         """As offline; where no keyframes are made, the local map follows the landmarks in view."""
         T_world_camera = super()._record_pose(frame, tracked, keyframe)
+        reference = self.camera_tracker.reference
+        if self.dense and reference and tracked.status.by_image and T_world_camera is not None:
+            self.dense.frames.offer(frame, T_world_camera, reference, keyframe)
         if not self.remote.extends and T_world_camera is not None:
             self._located += 1
             near = self.remote.world.covisible(tracked.landmark_ids, 1)

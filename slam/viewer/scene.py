@@ -7,6 +7,7 @@ world/keyframes       their positions; ``world/loops``: lines between the ends o
 world/landmarks       points in the colours of their labels, else in their own
 world/objects         boxes with labels
 world/dense           the dense cloud of a finished run
+world/surface/X_Y_Z   in a live run: a part of the dense map's surface, as triangles
 world/submaps/ID      in a live run: some points of each submap, in the frame of its keyframe
 plots/...             status, inliers, milliseconds of each stage, queues
 ====================  ==============================================================================
@@ -18,7 +19,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -32,6 +33,9 @@ from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 from bmask_slam.viewer.web_viewer import LOCAL, WebViewer
+
+if TYPE_CHECKING:  # it loads torch
+    from bmask_slam.mapping.surface.parts import SurfacePart
 
 logger = logging.getLogger(__name__)
 
@@ -139,6 +143,22 @@ class Scene:
     ) -> None:
         """Show points (N, 3) with colours (N, 3)."""
         self._log(path, self._rr.Points3D(points, colors=colours, radii=radius_m))
+
+    def log_surface_part(self, part: SurfacePart) -> None:
+        """Show a part of a surface in place of what was shown of its region."""
+        rr, path = self._rr, f"world/surface/{'_'.join(map(str, part.region))}"
+        if not len(part.triangles):
+            self._log(path, rr.Clear(recursive=True))
+            return
+        self._log(
+            path,
+            rr.Mesh3D(
+                vertex_positions=part.vertices,
+                triangle_indices=part.triangles,
+                vertex_normals=part.normals,
+                vertex_colors=part.colours,
+            ),
+        )
 
     def log_submap(self, number: int, points: Floats, colours: Bytes) -> None:
         """Show points (N, 3) with colours (N, 3), in the frame given by ``move_submap``."""

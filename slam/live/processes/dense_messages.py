@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Set
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
+from bmask_slam.dense.growing.frames import FrameOptions
 from bmask_slam.dense.keyframe_input import KeyframeSnapshot
 from bmask_slam.graph.arrays import Array, Bytes, Floats, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
+
+SAME = 1e-4
+"""Poses whose numbers differ by less are the same."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +35,8 @@ class DenseSetup:
         labels: names of its classes.
         shown: largest number of points of a submap for a viewer; 0: there is no viewer.
         mesh_voxel_m: as in `MapOptions`.
+        frames: which frames the surface gets besides keyframes.
+        grows: whether the surface grows on the way, else it is made at the end.
     """
 
     run: Path
@@ -34,6 +45,8 @@ class DenseSetup:
     labels: tuple[str, ...]
     shown: int = 0
     mesh_voxel_m: float | None = None
+    frames: FrameOptions = field(default_factory=FrameOptions)
+    grows: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +84,44 @@ class RemoveKeyframes:
     """To the process: these keyframes are no longer in the map."""
 
     keyframe_ids: list[int]
+
+
+@dataclass(frozen=True, eq=False)
+class MapPoses:
+    """To the process: where keyframes are, for the surface.
+
+    Attributes:
+        ids: (N,) keyframes of the largest map segment, and culled ones that frames of it follow.
+        poses: (N, 4, 4) their T_world_camera.
+    """
+
+    ids: Ints
+    poses: Array
+
+    @classmethod
+    def of(cls, world: WorldMap, history: FrameHistory, followed: Set[int]) -> MapPoses:
+        """As they are now; ``followed`` are keyframes that may have been culled."""
+        segment = world.largest_segment()
+        poses = {k.id: k.T_world_camera for k in world.in_segment(segment)}
+        for culled in followed - world.keyframes.keys():
+            parent, T_parent_culled = history.parent(culled)
+            if parent in poses:
+                poses[culled] = poses[parent] @ T_parent_culled
+        return cls(np.array(list(poses), np.int64), np.array(list(poses.values())))
+
+    def is_like(self, other: MapPoses) -> bool:
+        """Whether the same keyframes are where they were, to a tenth of a millimetre."""
+        same = np.array_equal(self.ids, other.ids)
+        return same and bool(np.allclose(self.poses, other.poses, rtol=0, atol=SAME))
+
+    def by_id(self) -> dict[int, Array]:
+        """T_world_camera (4, 4) by id."""
+        return dict(zip(self.ids.tolist(), self.poses, strict=True))
+
+
+@dataclass(frozen=True)
+class ShowSurface:
+    """To the process: parts of the surface that change are wanted from now on."""
 
 
 @dataclass(frozen=True)
@@ -133,11 +184,13 @@ class MapWritten:
         points: in the cloud.
         missing: keyframes of the map without a submap.
         failure: why the clouds are not written; empty if they are.
+        frames: in the surface besides keyframes.
     """
 
     points: int = 0
     missing: list[int] = field(default_factory=list)
     failure: str = ""
+    frames: int = 0
 
     def log_missing(self, run: Path, has_images: bool) -> None:
         """Log how the map of a run is completed, if it has to be."""

@@ -1,4 +1,7 @@
-"""The dense map's process: fuses keyframes into submaps, as ``bmask-slam map`` does."""
+"""The dense map's process: fuses keyframes into submaps, as ``bmask-slam map`` does.
+
+Between messages the surface grows, of keyframes and of the frames that are sent between them.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,8 @@ from typing import Any
 import cv2
 
 from bmask_slam.dense.folder import DenseFolder, folder_settings
+from bmask_slam.dense.growing.frames import SurfaceFrame
+from bmask_slam.dense.growing.worker import SurfaceWorker
 from bmask_slam.dense.keyframe_fusion import FusionCounts, KeyframeFusion
 from bmask_slam.dense.keyframe_input import dense_keyframe
 from bmask_slam.dense.map_run import MapSummary, write_summary
@@ -30,21 +35,25 @@ from bmask_slam.live.processes.dense_messages import (
     KeyframeToMap,
     LateMasks,
     Mapped,
+    MapPoses,
     MapWritten,
     NotMapped,
     Preview,
     RemoveKeyframes,
     RunMoved,
+    ShowSurface,
 )
 from bmask_slam.mapping.inverse_depth.dense_mapper import FusedKeyframe
 from bmask_slam.mapping.products.submaps import Submap
 from bmask_slam.mapping.products.surface_labels import InstanceEvidence
 from bmask_slam.run_folder.folder import DISK_ERRORS
 from bmask_slam.semantics.labels import LabelSet
+from bmask_slam.semantics.torch_threads import one_thread
 
 logger = logging.getLogger(__name__)
 
 NICENESS = 15
+IDLE_S = 1.0
 
 
 def serve_dense(channel: Channel, setup: DenseSetup) -> None:
@@ -53,8 +62,19 @@ def serve_dense(channel: Channel, setup: DenseSetup) -> None:
     cv2.setNumThreads(1)
     server = DenseServer(setup, channel.send)
     channel.send(Ready())
-    for message in channel.messages():
-        server.handle(message)
+    with one_thread():
+        _serve(channel, server)
+
+
+def _serve(channel: Channel, server: DenseServer) -> None:
+    has_work = True
+    while True:
+        messages = channel.receive(0.0 if has_work else IDLE_S)
+        for message in messages:
+            server.handle(message)
+        if not messages and not channel.open:
+            return
+        has_work = server.growing.work()
 
 
 class RetryingFolder(DenseFolder):
@@ -83,7 +103,11 @@ class RetryingFolder(DenseFolder):
 
 
 class DenseServer:
-    """Handles the messages of tracking; answers go to ``send``."""
+    """Handles the messages of tracking; answers go to ``send``.
+
+    Attributes:
+        growing: the surface.
+    """
 
     def __init__(self, setup: DenseSetup, send: Callable[[Any], None]) -> None:
         """Start a dense map, or continue one that another process left. Raises InputError."""
@@ -94,6 +118,9 @@ class DenseServer:
         settings = folder_settings(self._options, self._labels)
         self._folder = RetryingFolder(setup.run, settings)
         self._fusion = KeyframeFusion(setup.camera, self._labels, self._folder, self._options)
+        self.growing = SurfaceWorker(self._folder, setup.camera, self._options, setup.frames, send)
+        self.growing.excluded = [self._labels.number(n) for n in self._options.excluded or ()]
+        self.growing.grows = setup.grows
 
     def handle(self, message: Any) -> None:
         """Handle one message."""
@@ -105,9 +132,17 @@ class DenseServer:
                 self.relabel(message)
             case RemoveKeyframes():
                 self._fusion.remove(message.keyframe_ids)
+                self.growing.remove(message.keyframe_ids)
+            case SurfaceFrame():
+                self.growing.add_frame(message)
+            case MapPoses():
+                self.growing.place(message.by_id())
+            case ShowSurface():
+                self.growing.is_shown = True
             case RunMoved():
                 self._run = message.run
                 self._folder.follow(message.run)
+                self.growing.reopen()
             case FinishMap():
                 self._fusion.update_poses(message.poses)
                 self._report(self._fusion.finish())
@@ -139,6 +174,9 @@ class DenseServer:
             self._fusion.relabel(message.keyframe_id, instances)
         except InputError as error:
             logger.warning("keyframe %d keeps its old labels: %s", message.keyframe_id, error)
+            return
+        if instances.excluded.any():
+            self.growing.mask(message.keyframe_id)
 
     def write_products(self, message: FinishMap) -> MapWritten:
         """Write the clouds from the run folder's final map."""
@@ -149,15 +187,17 @@ class DenseServer:
             fused = FusedMap(run, self._labels, self._folder, self._options)
             if not fused.keyframes():
                 return MapWritten(missing=missing, failure="no keyframe has a submap")
-            products = write_products(fused)
+            grown = self.growing.finish()
+            products = write_products(fused, grown=grown)
             counts = self._counts(missing, message.skipped)
             products_s = time.perf_counter() - started_s
             write_summary(self._folder, MapSummary(self._folder.path, counts, products, products_s))
+            self.growing.clear()
         except (InputError, OSError) as error:
             if isinstance(error, OSError) and error.errno not in DISK_ERRORS:
                 raise
             return MapWritten(failure=str(error))
-        return MapWritten(products.points, missing)
+        return MapWritten(products.points, missing, frames=grown.frames)
 
     def _counts(self, missing: list[int], skipped: dict[int, str]) -> FusionCounts:
         """Counts of the keyframes, with those that were not sent to this process."""
@@ -171,6 +211,7 @@ class DenseServer:
         for submap in submaps:
             reason = self._folder.unwritten.get(submap.anchor)
             if reason is None:
+                self.growing.add_keyframe(submap.anchor)
                 self._send(Mapped(submap.anchor, self._preview(submap)))
             else:
                 self._send(NotMapped(submap.anchor, reason, disk_full=True))

@@ -6,6 +6,9 @@ ready keyframes the newest is sent first, one at a time. At most MAX_WAITING wai
 the oldest, which is counted and listed in dense.json, and which ``bmask-slam map RUN`` adds. A
 keyframe that was sent is sent again to a new process if the process dies, and is skipped only if
 two processes die while handling it. The submap of a culled keyframe is removed.
+
+Frames between keyframes go to the surface as `FrameQueue` chooses them. The last process that is
+started does not let the surface grow before the end, in case that killed the others.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from bmask_slam.dense.growing.frames import FrameQueue, FramesTaken, ShownParts, SurfaceFrame
 from bmask_slam.dense.keyframe_input import KeyframeSnapshot
 from bmask_slam.graph.arrays import Floats
 from bmask_slam.live.messages import Masks
@@ -27,24 +31,30 @@ from bmask_slam.live.processes.dense_messages import (
     KeyframeToMap,
     LateMasks,
     Mapped,
+    MapPoses,
     MapWritten,
     NotMapped,
     Preview,
     RemoveKeyframes,
     RunMoved,
+    ShowSurface,
 )
 from bmask_slam.live.processes.supervision import RestartPolicy, SupervisedWorker
+from bmask_slam.mapping.surface.parts import SurfacePart
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 
 MAX_WAITING, CROWDED = 6, 4
 MASKS_S = 3.0
+PLACES_S = 1.0
+"""The keyframes' poses are sent so far apart."""
 AROUND = 32
 """Number of neighbouring keyframes whose poses are sent: more than the fusion holds."""
-MAX_KEYFRAME_CRASHES = 2
+MAX_KEYFRAME_CRASHES = LAST_CRASH = 2
 LATE = "newer keyframes came first"
 
 
@@ -68,6 +78,8 @@ class RemoteDenseMapper:
         skipped: keyframes of the map that will get no submap, and why.
         dropped: how many of those were dropped because newer ones came.
         unwritten: how many could not be written because the disk was full.
+        frames: what the surface gets besides keyframes.
+        shown: parts of the surface.
         worker: the supervised process.
     """
 
@@ -78,6 +90,10 @@ class RemoteDenseMapper:
         self.listeners: list[Callable[[int, Floats], None]] = []
         self.skipped: dict[int, str] = {}
         self.keeps_previews = True
+        self.shown = ShownParts()
+        self.frames = FrameQueue(setup.frames, self._send_frame)
+        self._poses: MapPoses | None = None
+        self._place_s, self._has_moved = 0.0, False
         self.dropped = self.unwritten = 0
         self._waiting: dict[int, _Waiting] = {}
         self._sent: dict[int, KeyframeToMap] = {}
@@ -96,12 +112,34 @@ class RemoteDenseMapper:
 
     @property
     def full(self) -> bool:
-        """Whether one more keyframe would drop another."""
-        return len(self._waiting) >= MAX_WAITING and not self.worker.given_up
+        """Whether one more keyframe would drop another, or one more frame would be dropped."""
+        crowded = len(self._waiting) >= MAX_WAITING or self.frames.full
+        return crowded and not self.worker.given_up
 
     def wait_until_ready(self) -> None:
         """Wait until the process is ready. Raises InputError if it cannot start."""
         self.worker.wait_until_ready()
+
+    def show_surface(self, listener: Callable[[SurfacePart], None] | None = None) -> None:
+        """Call with each part of the surface that changes; None: keep them for a viewer."""
+        if listener is None:
+            self.shown.keeps = True
+        else:
+            self.shown.listeners.append(listener)
+        self.worker.send(ShowSurface())
+
+    def place(self, world: WorldMap, history: FrameHistory, moved: bool) -> None:
+        """Tell the surface where keyframes are, if some ``moved``, but not too often."""
+        self._has_moved |= moved
+        if self._has_moved and time.monotonic() >= self._place_s:
+            self._place_s, self._has_moved = time.monotonic() + PLACES_S, False
+            self._place(world, history)
+
+    def _place(self, world: WorldMap, history: FrameHistory) -> None:
+        poses = MapPoses.of(world, history, self.frames.references)
+        if self._poses is None or not poses.is_like(self._poses):
+            self._poses = poses
+            self.worker.send(poses)
 
     def follow(self, run: Path) -> None:
         """Let the process, and one that is started in its place, write to this run folder."""
@@ -172,9 +210,10 @@ class RemoteDenseMapper:
         self._to_resend = [number for number in self._to_resend if number in self._sent]
         self.worker.send(RemoveKeyframes(sorted(removed)))
 
-    def finish(self, world: WorldMap, timeout_s: float) -> MapWritten:
+    def finish(self, world: WorldMap, history: FrameHistory, timeout_s: float) -> MapWritten:
         """Map what waits and write the clouds; the run folder must hold the map by now."""
         self.remove_culled(world, lambda _: False)
+        self._place(world, history)
         poses = {k.id: k.T_world_camera for k in world.keyframes.values()}
         deadline_s, crashes_at_request = time.monotonic() + timeout_s, -1
         while self._written is None:
@@ -204,6 +243,10 @@ class RemoteDenseMapper:
                     self.unwritten += message.disk_full
                     self._sent.pop(message.keyframe_id, None)
                     self._skip(message.keyframe_id, message.reason)
+                case FramesTaken():
+                    self.frames.taken(message)
+                case SurfacePart():
+                    self.shown.take(message)
                 case MapWritten():
                     self._written = message
         if self.worker.restart_if_needed(busy=self._working is not None):
@@ -220,6 +263,10 @@ class RemoteDenseMapper:
                 self.previews[message.keyframe_id] = message.preview
             for listener in self.listeners:
                 listener(message.keyframe_id, message.preview.points)
+
+    def _send_frame(self, frame: SurfaceFrame) -> None:
+        if not self.worker.given_up:
+            self.worker.send(frame)
 
     def _send_new(self, number: int, world: WorldMap) -> None:
         """Send a keyframe with its present pose and landmarks."""
@@ -245,6 +292,13 @@ class RemoteDenseMapper:
                 self._skip(self._working, "the process crashed on it twice")
         self._working = None
         self._to_resend = sorted(self._sent)
+        if self._poses is not None:
+            self.worker.send(self._poses)
+        if self.shown.wanted:
+            self.worker.send(ShowSurface())
+        self.frames.send_again()
+        if self.worker.crashes >= LAST_CRASH:
+            self.worker.arguments = (replace(self._setup, grows=False),)
 
     def _skip(self, number: int, reason: str) -> None:
         self._waiting.pop(number, None)

@@ -28,6 +28,7 @@ from bmask_slam.live.processes.dense_messages import (
 from bmask_slam.live.processes.remote_dense import CROWDED, MAX_WAITING, RemoteDenseMapper
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.world_map import WorldMap
 
 SETUP = DenseSetup(Path("run"), CAMERA, SegmenterOptions(), ("background",))
@@ -206,7 +207,7 @@ def test_finish_sends_all_waiting_keyframes_despite_a_crash(dense, monkeypatch) 
             worker.answers += [Mapped(0, preview), full, MapWritten(5, [1, 2])]
 
     monkeypatch.setattr(worker, "send", send)
-    assert dense.finish(world, 5.0) == MapWritten(5, [1, 2])
+    assert dense.finish(world, FrameHistory(), 5.0) == MapWritten(5, [1, 2])
     assert worker.keyframes() == [1, 0, 0, 1]
     assert isinstance(worker.sent[-1], FinishMap)
     assert set(worker.sent[-1].poses) == {0, 1, 2}
@@ -223,5 +224,6 @@ def test_after_giving_up_all_keyframes_are_reported_as_skipped(dense) -> None:
     add_keyframes(dense, 2)
     assert sorted(dense.skipped) == [0, 1, 2]
     assert not dense.full
-    assert dense.finish(world, 5.0) == replace(MapWritten(), failure=dense.finish(world, 0).failure)
-    assert dense.finish(world, 5.0).failure
+    failure = dense.finish(world, FrameHistory(), 0).failure
+    assert dense.finish(world, FrameHistory(), 5.0) == replace(MapWritten(), failure=failure)
+    assert dense.finish(world, FrameHistory(), 5.0).failure
