@@ -200,9 +200,9 @@ def test_finish_sends_all_waiting_keyframes_despite_a_crash(dense, monkeypatch) 
         worker.sent.append(message)
         if isinstance(message, KeyframeToMap):
             worker.answers.append(Accepted(message.id))
-        elif not worker.crashes:
+        elif isinstance(message, FinishMap) and not worker.crashes:
             worker.crashes_next = True
-        else:
+        elif isinstance(message, FinishMap):
             full = NotMapped(1, "full", disk_full=True)
             worker.answers += [Mapped(0, preview), full, MapWritten(5, [1, 2])]
 
