@@ -22,7 +22,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.trajectory import nearest_indices, read_tum
 from bmask_slam.graph.whole_file import remove
-from bmask_slam.mapping.inverse_depth.depth_map import from_sensor
+from bmask_slam.mapping.inverse_depth.depth_map import MeasurementConfig, from_sensor
 from bmask_slam.mapping.inverse_depth.regularisation import regularise
 from bmask_slam.mapping.products.surface_labels import dilate
 from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame, mark_unexplained
@@ -97,6 +97,7 @@ class _SurfaceMaker:
         """Raises InputError: the volume cannot be stored."""
         self._fused = fused
         self._gate: KeyframeSurface | None = None
+        self._measurement = fusion_config(fused.options).measurement
         self._keyframes = {-1 - k.id: k for k in fused.keyframes()}
         self._folder = fused.folder.path / VOLUME
         refuse_link(self._folder)
@@ -191,7 +192,8 @@ class _SurfaceMaker:
         except InputError as error:
             logger.warning("%s; not in the surface", error)
             return None
-        return gated_frame(images, T_world_camera, self._gate, run.camera, options)
+        measured = self._measurement, options.surface_voxel_m
+        return gated_frame(images, T_world_camera, self._gate, run.camera, *measured)
 
 
 def keyframe_as_frame(
@@ -209,14 +211,19 @@ def keyframe_as_frame(
 
 
 def gated_frame(
-    images: Frame, T_world_camera: Array, gate: KeyframeSurface, camera: Camera, options: MapOptions
+    images: Frame,
+    T_world_camera: Array,
+    gate: KeyframeSurface,
+    camera: Camera,
+    measurement: MeasurementConfig,
+    voxel_m: float,
 ) -> DepthFrame:
     """A frame, distorted, for a volume: after Step 3, without what the gate refuses."""
     rgb, depth_m = undistort_images(images, camera)
-    measured = regularise(from_sensor(depth_m, camera, fusion_config(options).measurement))
+    measured = regularise(from_sensor(depth_m, camera, measurement))
     verdict = gate.judge(measured.depth_m(), T_world_camera)
     measured = measured.without(verdict.in_front)
-    frame = depth_frame(measured, rgb, T_world_camera, camera, options.surface_voxel_m)
+    frame = depth_frame(measured, rgb, T_world_camera, camera, voxel_m)
     mark_unexplained(frame, verdict.unexplained)
     return frame
 

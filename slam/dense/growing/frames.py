@@ -16,7 +16,7 @@ from bmask_slam.world.world_map import Keyframe
 
 EARLY = 0.9
 """A frame may come so early, as a share of the interval: stamps are not exact."""
-MAX_SENT, MAX_BACKLOG = 2, 25
+MAX_SENT, MAX_BACKLOG = 8, 25
 """Frames that may be on their way, and that may wait for the surface though their keyframes are
 there; one more is dropped."""
 

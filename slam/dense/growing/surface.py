@@ -16,7 +16,7 @@ import numpy as np
 
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.growing.store import FrameStore
-from bmask_slam.dense.options import MapOptions
+from bmask_slam.dense.options import MapOptions, fusion_config
 from bmask_slam.dense.surface import gated_frame, keyframe_as_frame, unmasked_depth_m
 from bmask_slam.graph.arrays import Array, Floats
 from bmask_slam.graph.camera import Camera
@@ -77,7 +77,7 @@ class GrowingSurface:
         self.fused = set(folder.finished())
         self.frames = frames
         self._folder, self._camera, self._options = folder, camera, options
-        self._excluded = excluded
+        self._excluded, self._measurement = excluded, fusion_config(options).measurement
         self._poses: dict[int, Array] = {}
         self._judges: dict[int, list[int]] = {}
         self._points: OrderedDict[int, Floats] = OrderedDict()
@@ -86,7 +86,8 @@ class GrowingSurface:
         self._following: Iterator[tuple[int, bool]] | None = None
         self._is_checked, self._turn = True, False
         self._changed: set[int] = set()
-        self._waiting: dict[Region, None] = {}
+        self._waiting: set[Region] = set()
+        self._given: dict[Region, int] = {}  # in which order they were looked at last
         self._shown: set[Region] = set()
 
     @property
@@ -192,7 +193,8 @@ class GrowingSurface:
         except InputError as error:
             logger.warning("%s; not in the surface", error)
             return None
-        return gated_frame(images, T_world_camera, gate, camera, options)
+        measured_m = self._measurement, options.surface_voxel_m
+        return gated_frame(images, T_world_camera, gate, camera, *measured_m)
 
     def _near(self, T_world_camera: Array) -> list[int]:
         """The keyframes that look at about the same place, the nearest first."""
@@ -233,20 +235,19 @@ class GrowingSurface:
         return without_crumbs(extract(volume, least), self._options.surface_voxel_m)
 
     def changed_parts(self, most: int = PARTS_AT_ONCE) -> list[SurfacePart]:
-        """At most so many parts that have changed: those never given first, then the longest.
+        """At most so many parts that have changed: new ones first, then those given longest ago.
 
         Parts that lack frames, while poses are followed, come later.
         """
         surface, volume = self._surface, self._surface.volume
-        self._waiting |= dict.fromkeys(sorted(regions_of(surface.take_changed())))
+        self._waiting |= regions_of(surface.take_changed())
         lacking = regions_of(volume.keys[np.flatnonzero(surface.stale.numpy())])
-        found = [region for region in self._waiting if region not in lacking]
-        found.sort(key=lambda region: region in self._shown)
         parts: list[SurfacePart] = []
-        for region in found:
+        for region in sorted(self._waiting - lacking, key=lambda r: (self._given.get(r, -1), r)):
             if len(parts) == most:
                 break
-            del self._waiting[region]
+            self._waiting.remove(region)
+            self._given[region] = max(self._given.values(), default=0) + 1
             seen = extract_region(volume, region)
             if len(seen.triangles) or region in self._shown:
                 self._shown.add(region)
