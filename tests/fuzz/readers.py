@@ -39,6 +39,7 @@ from bmask_slam.datasets.catalogue import read_catalogue
 from bmask_slam.datasets.obtain import read_sums
 from bmask_slam.datasets.unpack import unpack
 from bmask_slam.dense.folder import LABEL_FILE, DenseFolder
+from bmask_slam.dense.growing.store import FRAME_FILE, FrameStore
 from bmask_slam.dense.saved_map import read_saved_map
 from bmask_slam.evaluation import frame_stamps
 from bmask_slam.events import read_events
@@ -470,6 +471,17 @@ def read_evidence(path: Path) -> None:
     dense.evidence(1)
 
 
+EIGHT_BY_SIX = replace(CAMERA, width=8, height=6)
+
+
+def read_frame(path: Path) -> None:
+    folder = path.parent / "dense" / "frames"
+    folder.mkdir(parents=True)
+    (folder / "00000001").write_bytes(path.read_bytes())
+    for number in FrameStore(folder.parent, EIGHT_BY_SIX, 1 << 20).places:
+        FrameStore(folder.parent, EIGHT_BY_SIX, 1 << 20).load(number)
+
+
 def restore(path: Path) -> None:
     SlamSystem(CAMERA, CONFIG).restore(read_map(path)[0], path)
 
@@ -747,6 +759,7 @@ def array_readers(folder: Path) -> list[Reader]:
         "variances": points[:, 0], "instances": np.zeros(6, np.uint16),
     }  # fmt: skip
     image = np.ones((6, 8), np.uint16)
+    packed = (cv2.imencode(".png", image)[1], cv2.imencode(".jpg", np.zeros((6, 8, 3)))[1])
     evidence = {
         "log_likelihoods": np.zeros((3, 4), np.float32),
         "landmark_ids": np.arange(3), "landmark_instances": np.ones(3, np.uint16),
@@ -783,6 +796,9 @@ def array_readers(folder: Path) -> list[Reader]:
                   {"rho": image, "sigma": image}),
         of_arrays("keyframe labels", read_evidence, LABEL_FILE, {"stuff": ["wall", "floor"]},
                   evidence),
+        of_arrays("surface frame", read_frame, FRAME_FILE, {},
+                  {"depth": packed[0].reshape(-1), "colours": packed[1].reshape(-1),
+                   "T_reference_camera": np.eye(4), "follows": np.zeros(2, np.int64)}),
         Reader("PLY", "a.ply", read_ply, (cloud,)),
         Reader("landmarks.ply", "a.ply", lambda p: read_landmarks(p, ("unknown", "cup")), (cloud,)),
         Reader("dense/cloud.ply", "a.ply", lambda p: read_dense_cloud(p, ("b", "cup")), (cloud,)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import time
 from collections.abc import Callable
@@ -93,7 +94,8 @@ class SurfaceWorker:
             worked = self._begun().step()
         except InputError as error:
             self._surface, self._begin_s = None, time.monotonic() + RETRY_S
-            logger.warning("%s; the surface is begun again later", error)
+            gc.collect()  # its files are in a circle of objects
+            logger.warning("%s; the surface is begun again later", str(error))  # not its frames
             return False
         self._tell()
         if self.is_shown and time.monotonic() > self._show_s:

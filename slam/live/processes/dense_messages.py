@@ -107,7 +107,9 @@ class MapPoses:
             parent, T_parent_culled = history.parent(culled)
             if parent in poses:
                 poses[culled] = poses[parent] @ T_parent_culled
-        return cls(np.array(list(poses), np.int64), np.array(list(poses.values())))
+        return cls(
+            np.array(list(poses), np.int64), np.array(list(poses.values())).reshape(-1, 4, 4)
+        )
 
     def is_like(self, other: MapPoses) -> bool:
         """Whether the same keyframes are where they were, to a tenth of a millimetre."""
@@ -117,6 +119,9 @@ class MapPoses:
     def by_id(self) -> dict[int, Array]:
         """T_world_camera (4, 4) by id."""
         return dict(zip(self.ids.tolist(), self.poses, strict=True))
+
+
+NO_POSES = MapPoses(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ the oldest, which is counted and listed in dense.json, and which ``bmask-slam ma
 keyframe that was sent is sent again to a new process if the process dies, and is skipped only if
 two processes die while handling it. The submap of a culled keyframe is removed.
 
-Frames between keyframes go to the surface as `FrameQueue` chooses them. The last process that is
-started does not let the surface grow before the end, in case that killed the others.
+Frames between keyframes go to the surface as `FrameQueue` chooses. The last process lets it grow
+only at the end, in case that killed the others.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from bmask_slam.dense.keyframe_input import KeyframeSnapshot
 from bmask_slam.graph.arrays import Floats
 from bmask_slam.live.messages import Masks
 from bmask_slam.live.processes.dense_messages import (
+    NO_POSES,
     Accepted,
     DenseSetup,
     FinishMap,
@@ -49,9 +50,7 @@ from bmask_slam.world.world_map import WorldMap
 logger = logging.getLogger(__name__)
 
 MAX_WAITING, CROWDED = 6, 4
-MASKS_S = 3.0
-PLACES_S = 1.0
-"""The keyframes' poses are sent so far apart."""
+MASKS_S, PLACES_S = 3.0, 1.0
 AROUND = 32
 """Number of neighbouring keyframes whose poses are sent: more than the fusion holds."""
 MAX_KEYFRAME_CRASHES = LAST_CRASH = 2
@@ -71,7 +70,7 @@ class RemoteDenseMapper:
     """Sends keyframes to a process that fuses them into submaps.
 
     Attributes:
-        submaps: ids of keyframes that have a submap.
+        submaps: ids of those with a submap.
         previews: of finished submaps, which the viewer removes from here.
         keeps_previews: whether there is a viewer.
         listeners: called with the keyframe's id and the points of each preview.
@@ -92,14 +91,14 @@ class RemoteDenseMapper:
         self.keeps_previews = True
         self.shown = ShownParts()
         self.frames = FrameQueue(setup.frames, self._send_frame)
-        self._poses: MapPoses | None = None
-        self._place_s, self._has_moved = 0.0, False
+        self._poses = NO_POSES
         self.dropped = self.unwritten = 0
         self._waiting: dict[int, _Waiting] = {}
         self._sent: dict[int, KeyframeToMap] = {}
         self._to_resend: list[int] = []  # of those sent, after a restart
         self._working: int | None = None
         self._crashes_with: Counter[int] = Counter()
+        self._place_s, self._has_moved = 0.0, False
         self._written: MapWritten | None = None
         target = "bmask_slam.live.processes.dense_process:serve_dense"
         self._setup = setup
@@ -122,22 +121,18 @@ class RemoteDenseMapper:
 
     def show_surface(self, listener: Callable[[SurfacePart], None] | None = None) -> None:
         """Call with each part of the surface that changes; None: keep them for a viewer."""
-        if listener is None:
-            self.shown.keeps = True
-        else:
-            self.shown.listeners.append(listener)
+        self.shown.keeps |= listener is None
+        self.shown.listeners += [] if listener is None else [listener]
         self.worker.send(ShowSurface())
 
     def place(self, world: WorldMap, history: FrameHistory, moved: bool) -> None:
-        """Tell the surface where keyframes are, if some ``moved``, but not too often."""
+        """Tell the surface where keyframes are, if some ``moved``: once a second."""
         self._has_moved |= moved
-        if self._has_moved and time.monotonic() >= self._place_s:
-            self._place_s, self._has_moved = time.monotonic() + PLACES_S, False
-            self._place(world, history)
-
-    def _place(self, world: WorldMap, history: FrameHistory) -> None:
+        if not self._has_moved or time.monotonic() < self._place_s:
+            return
+        self._place_s, self._has_moved = time.monotonic() + PLACES_S, False
         poses = MapPoses.of(world, history, self.frames.references)
-        if self._poses is None or not poses.is_like(self._poses):
+        if not poses.is_like(self._poses):
             self._poses = poses
             self.worker.send(poses)
 
@@ -213,7 +208,8 @@ class RemoteDenseMapper:
     def finish(self, world: WorldMap, history: FrameHistory, timeout_s: float) -> MapWritten:
         """Map what waits and write the clouds; the run folder must hold the map by now."""
         self.remove_culled(world, lambda _: False)
-        self._place(world, history)
+        self._place_s = 0.0
+        self.place(world, history, True)
         poses = {k.id: k.T_world_camera for k in world.keyframes.values()}
         deadline_s, crashes_at_request = time.monotonic() + timeout_s, -1
         while self._written is None:
@@ -265,8 +261,7 @@ class RemoteDenseMapper:
                 listener(message.keyframe_id, message.preview.points)
 
     def _send_frame(self, frame: SurfaceFrame) -> None:
-        if not self.worker.given_up:
-            self.worker.send(frame)
+        self.worker.send(frame)
 
     def _send_new(self, number: int, world: WorldMap) -> None:
         """Send a keyframe with its present pose and landmarks."""
@@ -292,8 +287,7 @@ class RemoteDenseMapper:
                 self._skip(self._working, "the process crashed on it twice")
         self._working = None
         self._to_resend = sorted(self._sent)
-        if self._poses is not None:
-            self.worker.send(self._poses)
+        self.worker.send(self._poses)
         if self.shown.wanted:
             self.worker.send(ShowSurface())
         self.frames.send_again()
