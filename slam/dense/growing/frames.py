@@ -94,7 +94,8 @@ class FrameQueue:
         self._options, self._send = options, send
         self._sent: dict[int, SurfaceFrame] = {}
         self._backlog, self._after = 0, -1
-        self._last: tuple[float, Array] | None = None
+        self._last_s = -np.inf
+        self._T_world_last: Array | None = None
 
     @property
     def full(self) -> bool:
@@ -113,13 +114,13 @@ class FrameQueue:
         If it became a ``keyframe`` itself it is not needed.
         """
         if keyframe is not None:
-            self._after, self._last = keyframe.id, (frame.timestamp_s, T_world_camera)
+            self._after, self._T_world_last = keyframe.id, T_world_camera
         if not self._shows_more(frame.timestamp_s, T_world_camera):
             return
         if self.full:
             self.dropped += 1
             return
-        self._last = frame.timestamp_s, T_world_camera
+        self._last_s, self._T_world_last = frame.timestamp_s, T_world_camera
         own = replace(frame, rgb=frame.rgb.copy(), depth_m=frame.depth_m.copy())
         T_reference_camera = inverse(reference.T_world_camera) @ T_world_camera
         chosen = SurfaceFrame(own, self._after, reference.id, T_reference_camera)
@@ -140,9 +141,10 @@ class FrameQueue:
             self._send(chosen)
 
     def _shows_more(self, timestamp_s: float, T_world_camera: Array) -> bool:
-        options = self._options
-        last_s, T_world_last = self._last or (timestamp_s, T_world_camera)
-        if (timestamp_s - last_s) * options.per_s < EARLY:
+        options, T_world_last = self._options, self._T_world_last
+        if T_world_last is None or options.per_s == 0:
+            return False
+        if (timestamp_s - self._last_s) * options.per_s < EARLY:
             return False
         T = inverse(T_world_last) @ T_world_camera
         turn_deg = np.rad2deg(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))

@@ -47,6 +47,7 @@ NEAR, APART_M, AHEAD_M = 12, 2.5, 1.5
 which is so far ahead of the camera."""
 POINT_STEP_PX, CACHED = 4, 40
 """Every fourth pixel of a keyframe is a point of the judge; so many keyframes' are kept."""
+PATIENCE = 30
 PART_VOXELS, PARTS_AT_ONCE = 2, 3
 """Parts for a viewer have one vertex in a cell of two voxels; and how many are made at once."""
 
@@ -84,7 +85,7 @@ class GrowingSurface:
         volume = SurfaceVolume(options.surface_voxel_m, camera, folder=folder.path)
         self._surface = FollowingSurface(volume, self._load)
         self._following: Iterator[tuple[int, bool]] | None = None
-        self._is_checked, self._turn = True, False
+        self._is_checked, self._turn, self._added = True, False, 0
         self._changed: set[int] = set()
         self._waiting: set[Region] = set()
         self._given: dict[Region, int] = {}  # in which order they were looked at last
@@ -134,23 +135,25 @@ class GrowingSurface:
         Raises:
             InputError: the disk is full; it cannot be used any more.
         """
-        due = self.due(ended)
-        self._turn = not self._turn
-        if due and (self._turn or (self._following is None and self._is_checked)):
+        due, self._turn = self.due(ended), not self._turn
+        has_time = not due or self._added >= PATIENCE
+        follows = self._following is not None or (has_time and not self._is_checked)
+        if due and (self._turn or not follows):
             self._integrate(due[0])
             return True
-        if self._following is None and not self._is_checked:
+        if not follows:
+            return False
+        if self._following is None:
             self._begin_following()
-        if self._following is not None:
-            while (step := next(self._following, None)) is not None:
-                if step[1]:
-                    return True
-            self._following = None
-            return True
-        return bool(due)
+        for _, was_read in self._following or ():
+            if was_read:
+                return True
+        self._following, self._added = None, 0
+        return True
 
     def _integrate(self, number: int) -> None:
         frame = self._load(number, self._pose(number))
+        self._added += 1
         if frame is not None:
             self._surface.add(number, frame)
         elif number < 0:

@@ -253,9 +253,9 @@ def test_frames_are_chosen_by_time_and_motion() -> None:
     sent.offer(0.0, POSES[0])  # before the first keyframe
     sent.offer(0.1, POSES[0], keyframe=0)
     for time_s, xi in (
-        (0.2, (0, 0, 0, 0.05, 0, 0)),  # too early
-        (0.3, (0, 0, 0, 0.02, 0, 0)),  # too near
+        (0.2, (0, 0, 0, 0.02, 0, 0)),  # too near
         (0.4, (0, 0, 0, 0.05, 0, 0)),
+        (0.5, (0, 0, 0, 0.15, 0, 0)),  # too early
         (0.6, (0, 0.04, 0, 0.05, 0, 0)),  # not turned enough
         (0.8, (0, 0.06, 0, 0.05, 0, 0)),
     ):
