@@ -15,6 +15,7 @@ from synthetic_view import CAMERA, PlaneViews, sideways_path
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.dense.folder import DenseFolder
+from bmask_slam.dense.growing.frames import FrameOptions
 from bmask_slam.dense.saved_map import read_saved_map
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.ply import read_ply
@@ -23,6 +24,7 @@ from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.processes import supervision
 from bmask_slam.live.processes.remote_dense import LATE
 from bmask_slam.live.processes.supervision import RestartPolicy
+from bmask_slam.mapping.surface.parts import SurfacePart
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import TrackingStatus
 
@@ -70,7 +72,10 @@ def test_a_process_that_is_killed_and_one_that_hangs_are_replaced_without_losing
 ) -> None:
     clock, run = Clock(), tmp_path / "run"
     monkeypatch.setattr(supervision, "time", clock)
-    with LiveSlam(CAMERA, CONFIG, LiveOptions(run, dense=True, mesh_voxel_m=0.03)) as slam:
+    options = LiveOptions(run, dense=True, mesh_voxel_m=0.03, surface_frames=FrameOptions(30, 0.01))
+    parts: list[SurfacePart] = []
+    with LiveSlam(CAMERA, CONFIG, options) as slam:
+        slam.on_surface(parts.append)
         track_frames(slam, FRAMES[:7], 0)
         killed = slam.processes()["dense"]
         os.kill(killed, signal.SIGKILL)
@@ -91,6 +96,10 @@ def test_a_process_that_is_killed_and_one_that_hangs_are_replaced_without_losing
     health = json.loads((run / "health.json").read_text())
     assert (health["dense_deaths"], health["map_deaths"]) == (2, 0)
     assert health["submaps"] > 3
+    assert slam.dense is not None
+    assert health["surface_frames"] == slam.dense.frames > 0
+    assert not (run / "dense" / "frames").exists()
+    assert parts[-1].vertices.shape[1] == 3
     assert not running(pids)
 
 

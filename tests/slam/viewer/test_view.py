@@ -55,6 +55,7 @@ def test_the_recording_contains_camera_map_and_plots(recorded, name) -> None:
     for path in ("/world/landmarks", "/world/keyframes", "/world/camera/image"):
         assert rows[path] >= 1, path
     assert rows["/world/submaps/0" if name == "live.rrd" else "/world/dense"] >= 1
+    assert any("/world/surface/" in path for path in rows) == (name == "live.rrd")
 
 
 def test_without_rerun_the_error_names_the_package(monkeypatch, tmp_path) -> None:
