@@ -110,6 +110,10 @@ class GrowingSurface:
         self._changed |= {-1 - keyframe_id, *judged} & set(self._surface)
         self._is_checked = False
 
+    def reopen(self) -> None:
+        """Know the keyframes that are in the folder, which is another one."""
+        self.fused, self._is_checked = set(self._folder.finished()), False
+
     def remove(self, keyframe_ids: Collection[int]) -> None:
         """These keyframes are not in the map any more."""
         self.fused -= set(keyframe_ids)

@@ -18,6 +18,7 @@ from bmask_slam.dense.products import GrownSurface
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.mapping.surface.extraction import NOTHING
 
 logger = logging.getLogger(__name__)
 
@@ -69,7 +70,7 @@ class SurfaceWorker:
         """The folder is another one."""
         self._frames.open_in(self._folder.path)
         if self._surface is not None:
-            self._surface.fused = set(self._folder.finished())
+            self._surface.reopen()
 
     def add_keyframe(self, keyframe_id: int) -> None:
         """A keyframe is fused."""
@@ -90,12 +91,15 @@ class SurfaceWorker:
         """Let the surface grow a little; whether there is more to do."""
         if not self.grows or time.monotonic() < self._begin_s:
             return False
+        worked, failure = False, ""
         try:
             worked = self._begun().step()
         except InputError as error:
-            self._surface, self._begin_s = None, time.monotonic() + RETRY_S
-            gc.collect()  # its files are in a circle of objects
-            logger.warning("%s; the surface is begun again later", str(error))  # not its frames
+            failure = str(error)
+        if failure:
+            self._end()
+            self._begin_s = time.monotonic() + RETRY_S
+            logger.warning("%s; the surface is begun again later", failure)
             return False
         self._tell()
         if self.is_shown and time.monotonic() > self._show_s:
@@ -103,9 +107,22 @@ class SurfaceWorker:
         return worked
 
     def finish(self) -> GrownSurface:
-        """The surface of all that has come. Raises InputError: the disk is full."""
+        """The surface of all that has come; of keyframes alone where the disk is full.
+
+        Raises:
+            InputError: it is too full for these, too.
+        """
+        whole, failure = NOTHING, ""
+        try:
+            whole = self._begun().whole()
+        except InputError as error:
+            failure = str(error)
+        if failure:
+            logger.warning("%s; the surface is made of keyframes alone", failure)
+            self._frames.clear()
+            self._end()
+            whole = self._begun().whole()
         surface = self._begun()
-        whole = surface.whole()
         if self.is_shown:
             self._show(len(whole.vertices))
         self._tell()
@@ -123,6 +140,11 @@ class SurfaceWorker:
             self._surface = GrowingSurface(*made_of, self.excluded)
             self._surface.place(self._poses)
         return self._surface
+
+    def _end(self) -> None:
+        """Give the volume's room on the disk back; an exception that is handled would hold it."""
+        self._surface = None
+        gc.collect()  # it is in a circle of objects
 
     def _show(self, most: int) -> bool:
         """Send parts that have changed; whether there were some."""

@@ -21,6 +21,7 @@ from bmask_slam.mapping.surface.following import (
     displacement_m,
     read_kept,
 )
+from bmask_slam.mapping.surface.parts import as_part, extract_region, regions_of
 from bmask_slam.mapping.surface.volume import SurfaceVolume
 
 VOXEL_M, WALL_M, ERROR_M = 0.05, 2.0, 0.1
@@ -79,6 +80,48 @@ def test_a_loop_that_corrects_ten_centimetres_moves_the_surface() -> None:
     assert read == sorted(read)
     assert set(read) >= {0, 1, 2, 8, 9}
     assert surface.follow(TRUE) == 0
+
+
+def test_parts_of_all_regions_are_the_whole_surface() -> None:
+    surface = FollowingSurface(SurfaceVolume(VOXEL_M, CAMERA), seen_from)
+    for number, T in TRUE.items():
+        surface.add(number, seen_from(number, T))
+    whole = extract(surface.volume)
+    corners = np.zeros((0, 3, 6))
+    for region in regions_of(surface.take_changed()):
+        part = extract_region(surface.volume, region)
+        corners = np.concatenate([corners, corners_of(part)])
+        given = as_part(region, part, 2 * VOXEL_M)
+        assert len(given.vertices) < 0.6 * len(part.vertices) or not len(part.vertices)
+        assert np.abs(np.abs(given.vertices[:, 2]) - WALL_M).max(initial=0) < 0.002
+    assert not len(surface.take_changed())
+    one, other = (c.reshape(len(c), -1) for c in (corners, corners_of(whole)))
+    one, other = (c[np.lexsort(c.T)] for c in (one, other))
+    np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+def corners_of(surface: Surface) -> Array:
+    """Places and normals (M, 3, 6) of the triangles' corners."""
+    both = np.concatenate([surface.vertices, surface.normals], axis=1).astype(float)
+    return np.round(both[surface.triangles], 4)
+
+
+def test_following_in_steps_takes_frames_between_them() -> None:
+    surface = FollowingSurface(SurfaceVolume(VOXEL_M, CAMERA), seen_from)
+    for number in range(9):
+        surface.add(number, seen_from(number, drifted(number)))
+    surface.take_changed()
+    steps = surface.following({n: TRUE[n] for n in range(9)})
+    while not next(steps)[1]:
+        pass
+    assert surface.stale.any()
+    surface.add(9, seen_from(9, TRUE[9]))
+    assert sum(was_read for _, was_read in steps) > 0
+    assert not surface.stale.any()
+    assert len(surface.take_changed())
+    expected, found = scratch(TRUE), extract(surface.volume)
+    np.testing.assert_allclose(np.sort(found.views), np.sort(expected.views))
+    assert off_m(found) < 0.002
 
 
 def test_only_what_saw_changed_blocks_is_read_again() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from bmask_slam.dense.growing.frames import (
     SurfaceFrame,
 )
 from bmask_slam.dense.growing.store import FrameStore
+from bmask_slam.dense.growing.surface import GrowingSurface
 from bmask_slam.dense.keyframe_input import KeyframeSnapshot
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
@@ -52,6 +52,7 @@ IMAGES = render_plane(BETWEEN, 15)
 SEEN_BY_ALL = 0.165, 0.0, PLANE_Z_M
 """In the masks of all keyframes."""
 IDS, PIXELS = np.arange(4), np.array([[100.0, 100.0], [110.0, 120.0], [320.0, 240.0], [500, 300]])
+STEP = GrowingSurface.step
 LABELS = ("background", "person")
 
 
@@ -215,8 +216,15 @@ def test_a_bounded_store_and_a_full_disk_refuse_frames_and_say_so(small_disk, ca
     assert store.load(15).depth_m.shape == (480, 640)
 
 
+def refuse_frames(surface: GrowingSurface, ended: bool = False) -> bool:
+    """A step of a surface whose volume cannot grow by a frame."""
+    if any(number >= 0 for number in surface.due(ended)):
+        surface._surface.volume._reserve(1 << 20)
+    return STEP(surface, ended)
+
+
 @pytest.mark.parametrize("small_disk", ["30m"], indirect=True)
-def test_after_a_full_disk_the_surface_is_begun_again(small_disk, caplog) -> None:
+def test_after_a_full_disk_the_surface_is_begun_again(small_disk, caplog, monkeypatch) -> None:
     server = with_keyframes(make_server(small_disk / "run"))
     ballast = fill(small_disk)
     assert not server.growing.work()
@@ -224,8 +232,13 @@ def test_after_a_full_disk_the_surface_is_begun_again(small_disk, caplog) -> Non
     ballast.unlink()
     server.growing._begin_s = 0.0
     assert worked(server).views.max() == KEYFRAMES
-    server.growing._surface = None
-    gc.collect()  # the disk is unmounted
+    server.handle(between())
+    fill(small_disk)
+    monkeypatch.setattr(GrowingSurface, "step", refuse_frames)
+    grown = server.growing.finish()
+    assert "the surface is made of keyframes alone" in caplog.text
+    assert (grown.frames, grown.surface.views.max()) == (0, KEYFRAMES)
+    server.growing._end()  # the disk is unmounted
 
 
 # --- which frames --------------------------------------------------------------------------------
