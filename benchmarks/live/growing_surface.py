@@ -118,20 +118,23 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=2, help="live runs of each (default: 2)")
     text = "play it at its own speed; else it waits for the maps, and little is dropped"
     parser.add_argument("--realtime", action="store_true", help=text)
+    parser.add_argument("--ways", default=";".join(WAYS), help="which (default: %(default)s)")
+    parser.add_argument("--costs", action="store_true", help="the surfaces are not compared")
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
     rows: dict[str, dict[str, float]] = {}
     surfaces: dict[str, dict[str, float]] = {}
-    for name, per_s in WAYS.items():
+    for name in args.ways.split(";"):
+        per_s = WAYS[name]
         for k in range(args.repeat):
             out = args.work / f"{Path(args.sequence).name}-{name.replace(' ', '-')}-{k}"
             rows[f"{name}, {k}"] = in_own_process(
                 args.sequence, args.frames, out, per_s, args.realtime
             )
-        if per_s is not None:
+        if per_s is not None and not args.costs:
             surfaces |= {f"{name}, {what}": row for what, row in quality(out, args.truth)}
     title = Path(args.sequence).name
-    print("\n".join([*table(title, rows), *table(title, surfaces)]))
+    print("\n".join([*table(title, rows), *(table(title, surfaces) if surfaces else [])]))
 
 
 if __name__ == "__main__":

@@ -27,8 +27,7 @@ class FrameOptions:
 
     Attributes:
         per_s: at most so many a second, by their stamps; 0: none, the surface is of keyframes.
-        min_shift_m, min_turn_deg: the view must differ by one of these from that of the last
-            frame or keyframe.
+        min_shift_m, min_turn_deg: the view must differ by one of these from that of the last one.
         max_bytes: of their images, which are kept until the end; no more are used then.
     """
 
@@ -114,9 +113,11 @@ class FrameQueue:
         If it became a ``keyframe`` itself it is not needed.
         """
         if keyframe is not None:
-            self._after, self._T_world_last = keyframe.id, T_world_camera
-        if not self._shows_more(frame.timestamp_s, T_world_camera):
-            return
+            self._after = keyframe.id
+        elif self._after >= 0 and self._shows_more(frame.timestamp_s, T_world_camera):
+            self._choose(frame, T_world_camera, reference)
+
+    def _choose(self, frame: Frame, T_world_camera: Array, reference: Keyframe) -> None:
         if self.full:
             self.dropped += 1
             return
@@ -143,7 +144,7 @@ class FrameQueue:
     def _shows_more(self, timestamp_s: float, T_world_camera: Array) -> bool:
         options, T_world_last = self._options, self._T_world_last
         if T_world_last is None or options.per_s == 0:
-            return False
+            return options.per_s > 0
         if (timestamp_s - self._last_s) * options.per_s < EARLY:
             return False
         T = inverse(T_world_last) @ T_world_camera

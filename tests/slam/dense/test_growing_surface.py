@@ -266,17 +266,18 @@ def test_frames_are_chosen_by_time_and_motion() -> None:
     sent.offer(0.0, POSES[0])  # before the first keyframe
     sent.offer(0.1, POSES[0], keyframe=0)
     for time_s, xi in (
-        (0.2, (0, 0, 0, 0.02, 0, 0)),  # too near
-        (0.4, (0, 0, 0, 0.05, 0, 0)),
+        (0.2, (0, 0, 0, 0.02, 0, 0)),  # the first one
+        (0.4, (0, 0, 0, 0.04, 0, 0)),  # too near
+        (0.4, (0, 0, 0, 0.051, 0, 0)),
         (0.5, (0, 0, 0, 0.15, 0, 0)),  # too early
         (0.6, (0, 0.04, 0, 0.05, 0, 0)),  # not turned enough
         (0.8, (0, 0.06, 0, 0.05, 0, 0)),
     ):
         sent.offer(time_s, se3_exp(np.array(xi)))
-    assert [f.number for f in sent.frames] == [12, 24]
+    assert [f.number for f in sent.frames] == [6, 12, 24]
     first = sent.frames[0]
     assert (first.after, first.reference) == (0, 7)
-    shifted = se3_exp(np.array([0, 0, 0, 0.05, 0, 0]))
+    shifted = se3_exp(np.array([0, 0, 0, 0.02, 0, 0]))
     np.testing.assert_allclose(POSES[3] @ first.T_reference_camera, shifted, atol=1e-12)
     none = Sent(per_s=0.0)
     none.offer(0.0, POSES[0], keyframe=0)
