@@ -171,6 +171,7 @@ REPORTS = {
         ),
         "reading": ("What the figures say", ""),
         "goals": ("Goals reached and missed", ""),
+        "growing": ("The surface that grows", ""),
     }, markdown=frozenset({"rooms"})),
     "real-cameras": Report(RESULTS / "real-cameras.md", "Results: real cameras", {
         "table": ("Real sequences", "cameras.real_sequences --work {sequences}"),

@@ -119,7 +119,7 @@ class FrameQueue:
 
     def _choose(self, frame: Frame, T_world_camera: Array, reference: Keyframe) -> None:
         if self.full:
-            self.dropped += 1
+            self.dropped, self._last_s = self.dropped + 1, frame.timestamp_s
             return
         self._last_s, self._T_world_last = frame.timestamp_s, T_world_camera
         own = replace(frame, rgb=frame.rgb.copy(), depth_m=frame.depth_m.copy())
