@@ -48,7 +48,7 @@ class MapWorker:
         self._journal: dict[int, Any] = {}
         self._number = 0
         self._crashes_in_a_row = 0
-        self._is_ready = False
+        self._is_ready = self._has_failed = False
         self._started = self._crashed_at = self._resent = 0  # numbers of messages
         self._worker = self._start()
 
@@ -115,7 +115,8 @@ class MapWorker:
                 "the map's process died %d times in a row; it is not restarted", MAX_CRASHES
             )
             return
-        if not self._worker.was_killed:  # a message may be the cause
+        # one that failed may have taken so long to end that it was killed then
+        if self._has_failed or not self._worker.was_killed:  # a message may be the cause
             if self._crashed_at == self._started > 0:
                 self._skip(self._started)
             self._crashed_at = self._started
@@ -132,7 +133,7 @@ class MapWorker:
 
     def _send_again(self) -> None:
         """Start a process and send it what no saved state contains."""
-        self._resent = self._number
+        self._resent, self._has_failed = self._number, False
         self._worker = self._start()
         for number, message in sorted(self._journal.items()):
             self._worker.send((number, message))
@@ -164,6 +165,7 @@ class MapWorker:
                 case Ready():
                     self._is_ready = True
                 case Failure():
+                    self._has_failed = True
                     logger.error("the map's process failed: %s", message.text)
                 case _:
                     others.append(message)

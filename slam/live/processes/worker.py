@@ -34,8 +34,8 @@ logger = logging.getLogger(__name__)
 
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
 """Each worker uses one core at most: more threads of libraries would slow tracking down."""
-
-
+ENDING_S = 1.0
+"""Longest time for which a process that is ending by itself is waited for."""
 OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 """Exit codes of a process that another one has ended."""
 
@@ -127,7 +127,7 @@ class Worker:
         """Kill it. The messages that it sent before can still be received."""
         if not self._channel.open:  # it is ending by itself
             with suppress(subprocess.TimeoutExpired):
-                self._process.wait(1.0)
+                self._process.wait(ENDING_S)
         self._process.kill()
         self._process.wait()
         self._channel.drain()

@@ -117,7 +117,7 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
             "off",
             "--quiet",
             "--silence",
-            "30",
+            "300",
         )
         code = main(["live", f"ros2:{DOMAIN}", "--out", str(out), "--max-frames", str(FRAMES - 2),
                      *options])  # fmt: skip
