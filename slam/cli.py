@@ -30,7 +30,7 @@ from bmask_slam.commands.results import add_export, add_query
 from bmask_slam.commands.run import add_run
 from bmask_slam.commands.segmentation import add_evaluate_segmentation, add_segment, add_train
 from bmask_slam.commands.sequences import add_convert, add_download, add_info, add_render
-from bmask_slam.commands.show import add_film, add_report, add_view
+from bmask_slam.commands.show import add_doctor, add_film, add_report, add_view
 from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.extras import import_extra
 from bmask_slam.runtime.memory import is_out_of_memory, memory_limit_bytes
@@ -57,6 +57,7 @@ ADDED = (
     add_train,
     add_evaluate_segmentation,
     add_compare,
+    add_doctor,
 )
 """What adds a command, in the order of --help."""
 DESCRIPTION = "RGB-D SLAM on a GTSAM factor graph: a trajectory and a landmark map from a sequence."

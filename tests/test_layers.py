@@ -37,7 +37,7 @@ ROOMS = {
                tracking  loops  moving  runtime  sensing  back_end  labelling  system_config
                system_interface  run_folder  system_results  sensor_input  system  dense
                calibration  refinement  viewer  offline  merging  live  reporting  comparison  api
-               commands  cli  job_process  __init__  __main__""",
+               doctor  commands  cli  job_process  __init__  __main__""",
     "slam/sequences": "[...]  bags  formats  sequence  info  right_images  __init__",
     "slam/run_folder": "[...]  scene  export",
     "slam/rendering": "engine  things  rooms  [...]",

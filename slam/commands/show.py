@@ -1,8 +1,9 @@
-"""``bmask-slam view``, ``report`` and ``film``: a run in Rerun, as a web page, as a film."""
+"""``view``, ``report``, ``film``, ``doctor``: a run in a viewer, as page or film; the machine."""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
 from bmask_slam.commands.arguments import (
@@ -26,6 +27,13 @@ FILM_MORE = """\
 With the camera's path and the objects by name. The map is the dense one if there is one, else it is
 made of the film's depth images. A .gif or .webp begins again at its end. Give it after the run:
 the next report shows it."""
+DOCTOR = "say what is installed, which cameras are there, and how fast this machine is"
+DOCTOR_MORE = """\
+Loads every library that is installed, asks every camera library for its cameras, looks at memory,
+disk and limits, and measures tracking, iSAM2 and the network for a few seconds; says what each
+extra that is not there is for, what it costs, and the command. Exit status: 0 if nothing is wrong
+(an extra or a camera that is not there is no fault), 1 if the core lacks a library, an installed
+one cannot be loaded, or memory, disk or open files are too few for a run."""
 
 
 def add_view(commands: Commands) -> None:
@@ -108,3 +116,22 @@ def _film(arguments: argparse.Namespace) -> int:
         film = write_film(options, progress)
     print_result(arguments, film, lambda: f"Film        {film}", {"film": film})
     return 0
+
+
+def add_doctor(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser("doctor", help=DOCTOR, description=f"{DOCTOR}. {DOCTOR_MORE}")
+    parser.set_defaults(handler=_doctor)
+    parser.add_argument("--quick", action="store_true", help="do not measure the speed")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from bmask_slam.doctor.checkup import check, format_checkup
+    from bmask_slam.graph.files.json_file import format_json
+
+    found = check(with_speed=not arguments.quick)
+    result = asdict(found)
+    result["expectations"] = found.speed.expectations() if found.speed else []
+    print(format_json(result) if arguments.json else format_checkup(found))
+    return 1 if found.problems else 0
