@@ -131,8 +131,8 @@ def _live(arguments: argparse.Namespace) -> int:
                 ros2.deliver = slam.add_measurements
             for measured in measured_beside(arguments, options.images, config):
                 slam.add_measurements(measured)
-            if slam.viewer_url:
-                print(f"in a browser: {slam.viewer_url}", file=sys.stderr, flush=True)
+            for address in slam.viewer_addresses:
+                print(address, file=sys.stderr, flush=True)
             told = PlayOptions(not source.waits, quiet=arguments.quiet)
             ended_by = play(slam, source, told, ros2_listener(arguments, ros2))
     found: dict[str, Any] = {

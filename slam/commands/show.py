@@ -14,10 +14,11 @@ from bmask_slam.commands.arguments import (
     view_options,
 )
 
-VIEW = "show a finished run in Rerun"
+VIEW = "show a finished run in Rerun or Foxglove"
 VIEW_MORE = """\
 The map with labels and objects, the camera's path, loops, the dense cloud where there is one, and
-status and times of every frame. Needs  pip install 'bmask-slam[view]'."""
+status, times and uncertainty of every frame; its images, and masks of keyframes made anew, where
+the recording is still there. Needs  pip install 'bmask-slam[view]', or [foxglove]."""
 REPORT = "write a web page about a run: figures, warnings, plots, pictures"
 REPORT_MORE = """\
 One file that needs no network: open it in any browser, send it by mail. Also for a run that goes on
@@ -41,19 +42,28 @@ def add_view(commands: Commands) -> None:
     parser = commands.add_parser("view", help=VIEW, description=f"{VIEW}. {VIEW_MORE}")
     parser.set_defaults(handler=_view)
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a finished run")
+    parser.add_argument("--sequence", type=Path, metavar="DIR", help="its images, if they moved")
+    parser.add_argument("--no-images", action="store_true", help="show the map and plots alone")
     add_view_arguments(parser)
 
 
 def _view(arguments: argparse.Namespace) -> int:
-    from bmask_slam.viewer.replay import replay
+    from bmask_slam.viewer.replay import ReplayOptions, replay
     from bmask_slam.viewer.scene import Scene
 
-    scene = Scene(arguments.run.name, view_options(arguments, window=True))
-    count = replay(arguments.run, scene)
-    print(f"{count} frames of {arguments.run}")
+    where = view_options(arguments, window=True)
+    scene = Scene(arguments.run.name, where)
+    options = ReplayOptions(
+        arguments.sequence, not arguments.no_images, paced=where.foxglove_port > 0
+    )
     try:
-        if arguments.serve:
-            print(f"in a browser: {scene.url}  (Ctrl-C ends it)", flush=True)
+        for address in scene.addresses:
+            print(f"{address}  (Ctrl-C ends it)", flush=True)
+        count = replay(arguments.run, scene, options)
+        print(f"{count} frames of {arguments.run}", flush=True)
+        while where.foxglove_port:  # again and again, for who connects later
+            replay(arguments.run, scene, options)
+        if where.serve:
             _wait()
     finally:
         scene.close()
