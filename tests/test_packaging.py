@@ -216,6 +216,7 @@ def test_every_import_is_a_declared_dependency() -> None:
         "mpl_toolkits": "matplotlib",
         "rerun": "rerun-sdk",
         "rerun_cli": "rerun-sdk",
+        "foxglove": "foxglove-sdk",
         "PIL": "pillow",
         "ruamel": "ruamel.yaml",
     }

@@ -22,7 +22,7 @@ PURPOSES: dict[str, tuple[str, float | None, float | None]] = {
     "dense": ("dense maps: map, run --map, live --map, a map for nav2", 0.2, 0.9),
     "render": ("render, compare rendered", 0.38, 1.1),
     "view": ("view, live --view, --serve", 0.16, 0.5),
-    "foxglove": ("--foxglove of view and live", 0.01, 0.03),
+    "foxglove": ("--foxglove of view and live", 0.02, 0.05),
     "ray": ("segmentation on other machines, --ray", 0.08, 0.25),
     "ros": ("ROS bags and MCAP files", 0.01, 0.03),
     "ros2": ("live ros2:, without ROS", 0.02, 0.05),

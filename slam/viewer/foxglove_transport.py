@@ -7,6 +7,7 @@ each topic but plots and log.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -72,7 +73,8 @@ class FoxgloveTransport:
 
     def set_time(self, timestamp_s: float) -> None:
         """See `Transport`."""
-        self._ns = max(round(1e9 * timestamp_s), 0)
+        whole_s = math.floor(timestamp_s)  # a stamp of today in ns has more digits than a float
+        self._ns = max(10**9 * whole_s + round(1e9 * (timestamp_s - whole_s)), 0)
 
     def names(self, names: Sequence[str]) -> None:
         """Nothing: Foxglove shows names of boxes and masks, not of points."""
