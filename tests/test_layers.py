@@ -43,6 +43,7 @@ ROOMS = {
     "slam/rendering": "engine  things  rooms  [...]",
     "slam/live": """[...]  ros2  sources  processes  system  start  health  display
                     recorder  live_map  live_slam  play""",
+    "slam/live/sources": "[...]  cameras  opening",
     "slam/comparison": "experiment  jobs  statistics  report  [...]",
 }
 MAX_MODULES, MAX_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS = 12, 300, 40, 6

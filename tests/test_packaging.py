@@ -195,7 +195,7 @@ def test_every_requirement_is_a_range_that_its_constraint_is_in() -> None:
     from packaging.requirements import Requirement
 
     pins = _constraints()
-    alone = ("realsense", "record3d")  # which are in no other extra
+    alone = ("realsense", "record3d", "oak", "azure")  # which are in no other extra
     extras = {k: v for k, v in EXTRAS.items() if k not in alone}
     for text in [*PROJECT["dependencies"], *(t for texts in extras.values() for t in texts)]:
         requirement = Requirement(text)
@@ -240,7 +240,16 @@ def test_what_all_installs_has_the_packages_that_the_project_is_fixed_to() -> No
 
     (text,) = EXTRAS["all"]
     named = Requirement(text).extras
-    assert named == set(EXTRAS) - {"all", "dev", "docs", "realsense", "record3d", "ros2"}
+    assert named == set(EXTRAS) - {
+        "all",
+        "dev",
+        "docs",
+        "realsense",
+        "record3d",
+        "oak",
+        "azure",
+        "ros2",
+    }
     assert f"{PROJECT['name']}[all]" in EXTRAS["dev"]  # which make demo installs
     texts = [*PROJECT["dependencies"], *(text for name in named for text in EXTRAS[name])]
     installed = {_canonical(Requirement(text).name) for text in texts}

@@ -42,8 +42,9 @@ of their own. The run folder is that of `run`, with health.json, which is rewrit
 
 SENSORS = ("imu", "odometry", "position", "accelerometer")
 SOURCE_HELP = """\
-recording in any layout of docs/data.md, ROS 1 .bag, ROS 2 bag folder, .mcap, realsense: for the
-RealSense that is plugged in, opencv:N for device N of OpenNI 2, or ros2: (ros2:DOMAIN)"""
+recording in any layout of docs/data.md, ROS 1 .bag, ROS 2 bag folder, .mcap; a camera that is
+plugged in: realsense:, oak:, azure:, record3d:, opencv:N (device N of OpenNI 2); or ros2:
+(ros2:DOMAIN)"""
 
 
 def add_live(commands: Commands) -> None:

@@ -28,10 +28,10 @@ PURPOSES: dict[str, tuple[str, float | None, float | None]] = {
     "ros2": ("live ros2:, without ROS", 0.02, 0.05),
     "pandas": ("Comparison.to_pandas", 0.02, 0.1),
     "completion": ("tab completion of shells", 0.0, 0.0),
-    "realsense": ("live realsense:", None, None),
-    "oak": ("live oak:", None, None),
-    "azure": ("live azure:", None, None),
-    "record3d": ("live record3d:, recordings of Record3D", None, None),
+    "realsense": ("live realsense:", 0.01, 0.04),
+    "oak": ("live oak:", 0.1, 0.36),
+    "azure": ("live azure:, with the Azure Kinect SDK", None, None),
+    "record3d": ("live record3d:, recordings of Record3D", 0.001, 0.001),
 }
 """What an extra is for, and its download and disk in GB (docs/install.md); None: not measured."""
 APART = ("all", "dev", "docs")

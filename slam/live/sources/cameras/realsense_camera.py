@@ -8,22 +8,23 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.camera import Camera, distortion_terms
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import import_extra
-from bmask_slam.live.sources.camera_source import CameraImages, CameraSource
+from bmask_slam.live.sources.cameras.camera_source import (
+    CameraImages,
+    CameraSource,
+    chosen_camera,
+    fit_distortion,
+    pixel_grid,
+)
 from bmask_slam.live.sources.pairing import MAX_DIFFERENCE_S
-from bmask_slam.sequences import read_camera
 from bmask_slam.sequences.camera_presets import is_preset
-from bmask_slam.sequences.cameras import given_camera
-from bmask_slam.sequences.checks import check_depth_scale
 from bmask_slam.sequences.images import depth_in_metres
 
 SIZE = (640, 480)
 FPS = 30
 POLL_MS = 200
-MAX_RESIDUAL_PX = 0.5
-"""Largest error, over the image, of OpenCV's five distortion coefficients fitted to the device."""
 
 
 class RealSenseSource(CameraSource):
@@ -75,12 +76,10 @@ class RealSenseSource(CameraSource):
     def _find_camera(self, profile: Any, given: Path | None) -> Camera:
         """The given camera, or the device's own calibration."""
         scale = 1.0 / float(profile.get_device().first_depth_sensor().get_depth_scale())
-        if given is not None and not is_preset(given):
-            camera = read_camera(given)
-            check_depth_scale(camera, scale, str(given), "realsense's depth")
-            return camera
-        own = self._own_camera(profile, scale)
-        return own if given is None else given_camera(given, own)
+        if given is not None and not is_preset(given):  # its distortion need not fit OpenCV's
+            nominal = Camera(*SIZE, 1.0, 1.0, 0.0, 0.0, depth_scale=scale)
+            return chosen_camera(given, nominal, "realsense's depth")
+        return chosen_camera(given, self._own_camera(profile, scale), "realsense's depth")
 
     def _own_camera(self, profile: Any, scale: float) -> Camera:
         """The device's calibration, whose depth is ``scale`` to the metre."""
@@ -94,40 +93,9 @@ class RealSenseSource(CameraSource):
 
     def _samples(self, intrinsics: Any) -> tuple[Array, Array]:
         """Pixels (N, 2) on a grid, and their rays (N, 2) at z = 1 by the device's model."""
-        steps = np.linspace(0.02, 0.98, 20)
-        columns, rows = np.meshgrid(steps * intrinsics.width, steps * intrinsics.height)
-        pixels = np.column_stack([columns.ravel(), rows.ravel()])
+        pixels = pixel_grid(intrinsics.width, intrinsics.height)
         deproject = self._rs.rs2_deproject_pixel_to_point
         return pixels, np.array([deproject(intrinsics, list(p), 1.0)[:2] for p in pixels])
-
-
-def fit_distortion(camera: Camera, pixels: Array, rays: Array) -> Camera:
-    """The camera with the distortion that projects ``rays`` to ``pixels``, by least squares.
-
-    OpenCV's model is linear in k1, k2, p1, p2, k3 (``graph.camera.distortion_terms``).
-
-    Args:
-        pixels: (N, 2). rays: (N, 2) undistorted, at z = 1.
-
-    Raises:
-        InputError: the largest residual is too large, as for a fisheye lens.
-    """
-    terms = distortion_terms(rays)
-    A = np.concatenate([camera.fx * terms[:, 0], camera.fy * terms[:, 1]])
-    shift = pixels - (rays * [camera.fx, camera.fy] + [camera.cx, camera.cy])
-    b = shift.T.ravel()
-    solution = np.linalg.lstsq(A, b, rcond=None)[0]
-    residual_px = float(np.abs(A @ solution - b).max())
-    if residual_px > MAX_RESIDUAL_PX:
-        raise InputError(
-            f"the camera's distortion differs from OpenCV's by {residual_px:.1f} px; calibrate it "
-            "and give --camera F"
-        )
-    k1, k2, p1, p2, k3 = (float(value) for value in solution)
-    return Camera(
-        camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
-        (k1, k2, p1, p2, k3), camera.depth_scale, camera.fps,
-    )  # fmt: skip
 
 
 def _lag_s(colour: Any, depth: Any) -> float:
