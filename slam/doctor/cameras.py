@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bmask_slam.graph.extras import load_libusb
 from bmask_slam.graph.files.reading import in_short
 
 USB = Path("/sys/bus/usb/devices")
@@ -113,6 +114,7 @@ def _ask_apart(library: str) -> Asked:
 def ask(library: str) -> Asked:
     """What a library finds, in this process."""
     source, find = FINDERS[library]
+    load_libusb()
     try:
         return Asked(library, source, tuple(find(importlib.import_module(library))))
     except (ImportError, OSError, RuntimeError, AttributeError, TypeError) as error:

@@ -47,11 +47,12 @@ REQUIREMENT = re.compile(r"^([\w.-]+).*?(?:;.*extra == ['\"]([\w-]+)['\"])?$")
 LOAD_S = 120.0
 LOADING = """
 import importlib, json, sys
-from bmask_slam.mapping.open3d_loader import load_open3d
+from bmask_slam.graph.extras import load_libusb
+load_libusb()
 for name in sys.argv[1:]:
     print(json.dumps([name, None]), flush=True)
     try:
-        load_open3d() if name == "open3d" else importlib.import_module(name)
+        importlib.import_module(name)
     except BaseException as error:
         print(json.dumps([name, f"{type(error).__name__}: {error}"[:200]]), flush=True)
     else:

@@ -102,8 +102,10 @@ def _camera(text: str, options: SourceOptions) -> Source | None:
     """The camera that is plugged in, by its name; None if it is no name of one."""
     prefix, colon, number = text.partition(":")
     given = options.camera, options.silence_s
-    if f"{prefix}{colon}" in (REALSENSE, OAK) and not number:
-        return (RealSenseSource if text == REALSENSE else OakSource)(*given)
+    if f"{prefix}{colon}" == REALSENSE:
+        return RealSenseSource(*given, recording=Path(number) if number else None)
+    if text == OAK:
+        return OakSource(*given)
     kinds = {OPENCV: OpenCvSource, AZURE: AzureSource, RECORD3D: Record3dSource}
     kind = kinds.get(f"{prefix}{colon}")
     return None if kind is None else kind(_device(text, number), *given)

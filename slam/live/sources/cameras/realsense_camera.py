@@ -10,7 +10,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.extras import import_extra
+from bmask_slam.graph.extras import import_extra, load_libusb
 from bmask_slam.live.sources.cameras.camera_source import (
     CameraImages,
     CameraSource,
@@ -28,26 +28,38 @@ POLL_MS = 200
 
 
 class RealSenseSource(CameraSource):
-    """The first connected device, 640x480 at 30 Hz."""
+    """The first connected device, 640x480 at 30 Hz, or a recording that plays in its place."""
 
-    def __init__(self, camera: Path | None = None, silence_s: float = 10.0) -> None:
-        """Start the device.
+    def __init__(
+        self, camera: Path | None = None, silence_s: float = 10.0, recording: Path | None = None
+    ) -> None:
+        """Start the device; ``recording`` is a file of RealSense's own tools.
 
         Raises:
             InputError: pyrealsense2 is not installed, there is no device, or its distortion cannot
                 be described by OpenCV's model.
         """
-        super().__init__("realsense", silence_s)
+        super().__init__("realsense" if recording is None else recording.stem, silence_s)
+        load_libusb()
         self._rs: Any = import_extra("pyrealsense2", "realsense:", "realsense")
         rs = self._rs
         self._pipeline, self._align = rs.pipeline(), rs.align(rs.stream.color)
         streams = rs.config()
-        streams.enable_stream(rs.stream.color, *SIZE, rs.format.rgb8, FPS)
-        streams.enable_stream(rs.stream.depth, *SIZE, rs.format.z16, FPS)
+        size: tuple[int, ...] = SIZE
+        if recording is not None:
+            if not recording.is_file():
+                raise InputError(f"{recording}: no such recording")
+            streams.enable_device_from_file(str(recording), repeat_playback=False)
+            size = ()  # as it was recorded
+        rate_hz = FPS if recording is None else 0
+        streams.enable_stream(rs.stream.color, *size, rs.format.rgb8, rate_hz)
+        streams.enable_stream(rs.stream.depth, *size, rs.format.z16, rate_hz)
+        self._is_recorded = recording is not None
         try:
-            profile = self._pipeline.start(streams)
+            self._profile = profile = self._pipeline.start(streams)
         except RuntimeError as error:
-            raise InputError(f"realsense: cannot start ({error}); plug the camera in") from error
+            cure = "plug the camera in" if recording is None else "record colour (RGB8) and depth"
+            raise InputError(f"realsense: cannot start ({error}); {cure}") from error
         try:
             self.camera = self._find_camera(profile, camera)
         except BaseException:
@@ -57,6 +69,8 @@ class RealSenseSource(CameraSource):
     def _capture_images(self) -> CameraImages | None:
         received, images = self._pipeline.try_wait_for_frames(POLL_MS)
         if not received:
+            if self._is_recorded and self._has_ended():
+                self.close()
             return None
         aligned = self._align.process(images)
         colour, depth = aligned.get_color_frame(), aligned.get_depth_frame()
@@ -69,6 +83,10 @@ class RealSenseSource(CameraSource):
         return CameraImages(
             1e-3 * colour.get_timestamp(), rgb, depth_in_metres(stored, self.camera)
         )
+
+    def _has_ended(self) -> bool:
+        playback = self._profile.get_device().as_playback()
+        return bool(playback.current_status() == self._rs.playback_status.stopped)
 
     def _release(self) -> None:
         self._pipeline.stop()
