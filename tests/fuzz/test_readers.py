@@ -49,6 +49,8 @@ ELSEWHERE = {
     "semantics/weights/light_weights.py": "whether a file says that it is one",
     "slam/job_process.py": "its own argument",
     "slam/dense/folder.py": "what it has just made",
+    "slam/doctor/cameras.py": "/sys",
+    "slam/doctor/machine.py": "/proc, /sys",
     "slam/runtime/machine.py": "/proc",
     "slam/runtime/memory.py": "/proc",
     "slam/live/processes/worker.py": "/proc",
