@@ -51,6 +51,7 @@ ELSEWHERE = {
     "slam/dense/folder.py": "what it has just made",
     "slam/doctor/cameras.py": "/sys",
     "slam/doctor/machine.py": "/proc, /sys",
+    "slam/doctor/packages.py": "what its own process prints",
     "slam/runtime/machine.py": "/proc",
     "slam/runtime/memory.py": "/proc",
     "slam/live/processes/worker.py": "/proc",
