@@ -138,10 +138,13 @@ def add_doctor(commands: Commands) -> None:
 
 def _doctor(arguments: argparse.Namespace) -> int:
     from bmask_slam.doctor.checkup import check, format_checkup
-    from bmask_slam.graph.files.json_file import format_json
 
     found = check(with_speed=not arguments.quick)
-    result = asdict(found)
-    result["expectations"] = found.speed.expectations() if found.speed else []
-    print(format_json(result) if arguments.json else format_checkup(found))
+    if arguments.json:
+        from bmask_slam.graph.files.json_file import format_json  # needs numpy, which may be broken
+
+        told = found.speed.expectations() if found.speed else []
+        print(format_json(asdict(found) | {"expectations": told}))
+    else:
+        print(format_checkup(found))
     return 1 if found.problems else 0

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from bmask_slam import __version__
 from bmask_slam.doctor.cameras import USB_2_MBIT, Asked, UsbCamera, ask_libraries, find_usb_cameras
 from bmask_slam.doctor.machine import Machine, Torch, find_machine, find_torch
 from bmask_slam.doctor.packages import CORE, Extra, find_extras, import_name
-from bmask_slam.doctor.speed import Speed, measure_speed
+
+if TYPE_CHECKING:
+    from bmask_slam.doctor.speed import Speed
 
 NETWORK = "semantics"
 SLOW_USB = "on USB 2, where 640x480 at 30 Hz is too much for it; use a blue socket (USB 3)"
@@ -48,10 +50,17 @@ def check(with_speed: bool = True) -> Checkup:
     asked = ask_libraries([import_name(name) for name in working])
     return Checkup(
         __version__, extras, torch, machine, usb, asked,
-        measure_speed(networks) if with_speed and core_works else None,
+        _measured(networks) if with_speed and core_works else None,
         (*_faults(extras), *machine.problems()),
         tuple(_hints(extras, torch, usb)),
     )  # fmt: skip
+
+
+def _measured(networks: bool) -> Speed:
+    """The speed; all else works without the libraries of the core, which may be broken."""
+    from bmask_slam.doctor.speed import measure_speed  # noqa: PLC0415 - loads them
+
+    return measure_speed(networks)
 
 
 def _faults(extras: tuple[Extra, ...]) -> list[str]:
@@ -156,7 +165,7 @@ def _speed_lines(speed: Speed | None) -> list[str]:
         f"of which iSAM2 {speed.isam2_ms:.1f} ms",
         *(
             []
-            if np.isnan(speed.network_ms)
+            if math.isnan(speed.network_ms)
             else [f"  network    {speed.network_ms:.0f} ms an image"]
         ),
         *(f"  {text}" for text in speed.expectations()),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -44,7 +45,7 @@ def plug_in(monkeypatch: pytest.MonkeyPatch, *extras: Extra, usb: tuple = ()) ->
     monkeypatch.setattr(checkup, "ask_libraries", lambda names: (Asked("cv2", "opencv:"),))
     monkeypatch.setattr(
         checkup,
-        "measure_speed",
+        "_measured",
         lambda network: SPEED if network else replace(SPEED, network_ms=np.nan),
     )
 
@@ -110,6 +111,20 @@ def test_a_camera_on_usb_gets_its_extra_its_socket_and_its_rights(monkeypatch, c
 )
 def test_expectations(speed: Speed, words: str) -> None:
     assert any(words in text for text in speed.expectations())
+
+
+def test_it_needs_none_of_the_libraries_that_it_looks_for() -> None:
+    blocked = ("numpy", "gtsam", "cv2", "scipy", "faiss", "matplotlib", "pydantic", "torch", "tqdm")
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({blocked!r}))\n"
+        "import bmask_slam.doctor.checkup as c\n"
+        "from bmask_slam.cli import main\n"
+        "c.find_extras, c.find_torch = lambda: (), lambda: None\n"
+        "sys.exit(main(['doctor', '--quick']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "nothing is wrong" in done.stdout
 
 
 # --- packages ------------------------------------------------------------------------------------
