@@ -52,8 +52,15 @@ def check(with_speed: bool = True) -> Checkup:
         __version__, extras, torch, machine, usb, asked,
         _measured(networks) if with_speed and core_works else None,
         (*_faults(extras), *machine.problems()),
-        tuple(_hints(extras, torch, usb)),
+        (*_hints(extras, torch, usb), *_busy(machine)),
     )  # fmt: skip
+
+
+def _busy(machine: Machine) -> list[str]:
+    cores = int(machine.hardware["cores"])
+    if machine.load is None or machine.load < cores:
+        return []
+    return [f"{machine.load:.0f} programs share {cores} cores: the speed is what they leave"]
 
 
 def _measured(networks: bool) -> Speed:

@@ -41,6 +41,7 @@ class Machine:
         open_files: how many a process may have.
         address_gb: limit of ``ulimit -v``; None without one.
         shm_gb: free in /dev/shm.
+        load: how many processes wanted a core in the last minute.
     """
 
     hardware: dict[str, str]
@@ -49,6 +50,7 @@ class Machine:
     open_files: int | None
     address_gb: float | None
     shm_gb: float | None
+    load: float | None = None
 
     def problems(self) -> list[str]:
         """What stands in the way of a run, each with its cure."""
@@ -85,6 +87,7 @@ def find_machine() -> Machine:
         _open_files(),
         None if limit is None else limit / 1e9,
         shutil.disk_usage(SHM).free / 1e9 if SHM.is_dir() else None,
+        os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
     )
 
 

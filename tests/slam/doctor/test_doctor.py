@@ -103,10 +103,10 @@ def test_a_camera_on_usb_gets_its_extra_its_socket_and_its_rights(monkeypatch, c
 @pytest.mark.parametrize(
     ("speed", "words"),
     [
-        (replace(SPEED, frame_ms=50.0), "about 20 frames a second: set the camera to 15 Hz"),
+        (replace(SPEED, frame_ms=50.0), "about 11 frames a second: set the camera to 15 Hz"),
         (replace(SPEED, network_ms=900.0), "the network falls behind"),
         (replace(SPEED, network_ms=np.nan), "labels: not measured"),
-        (SPEED, "about 0.4 minutes"),
+        (SPEED, "about 1.0 minutes"),
     ],
 )
 def test_expectations(speed: Speed, words: str) -> None:
@@ -190,6 +190,12 @@ def test_too_little_of_something_is_a_problem() -> None:
         "a process may open 256 files",
     ]
     assert MACHINE.problems() == []
+
+
+def test_a_busy_machine_is_said() -> None:
+    (text,) = checkup._busy(replace(MACHINE, load=7.8))
+    assert text.startswith("8 programs share 2 cores")
+    assert checkup._busy(replace(MACHINE, load=0.5)) == []
 
 
 def test_this_machine_is_looked_at() -> None:
