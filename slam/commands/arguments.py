@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
     from bmask_slam.sequences.bags.topics import BagTopics
     from bmask_slam.system_config import SystemConfig
-    from bmask_slam.viewer.scene import ViewOptions
+    from bmask_slam.viewer.options import ViewOptions
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
-WEB_PORT = 9090
+WEB_PORT, FOXGLOVE_PORT = 9090, 8765
 DETAILS = (
     *("rpe_trans_rmse_frame", "rpe_rot_rmse_frame", "ate_rot_rmse", "tracking_ms_p95"),
     *("isam2_update_ms_median", "isam2_update_ms_p95", "latency_ms_p95"),
@@ -142,7 +142,7 @@ def chosen_config(arguments: argparse.Namespace) -> ChosenConfig:
 
 
 def add_view_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add where it goes: --record, or --serve and --host."""
+    """Add where it goes: --record or --serve, --foxglove, and --host."""
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--record", type=Path, metavar="F.rrd", help="write a Rerun recording")
     where.add_argument(
@@ -155,20 +155,40 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"show it in a browser (port {WEB_PORT})",
     )
     parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        metavar="ADDRESS",
-        help="address that --serve listens on; others than this machine's own let everyone in",
+        "--foxglove",
+        nargs="?",
+        const=str(FOXGLOVE_PORT),
+        metavar="PORT|F.mcap",
+        help=f"for Foxglove: a websocket (port {FOXGLOVE_PORT}), or a file F.mcap",
     )
+    text = "address that --serve and --foxglove listen on; others than this machine's own let "
+    text += "everyone in"
+    parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help=text)
 
 
 def view_options(arguments: argparse.Namespace, window: bool) -> ViewOptions:
     """What was asked for; ``window``: Rerun's own window, if nothing else was."""
-    from bmask_slam.viewer.scene import ViewOptions
+    from bmask_slam.viewer.options import ViewOptions
 
-    other_output = arguments.record is not None or arguments.serve > 0
-    window = window and not other_output
-    return ViewOptions(arguments.record, arguments.serve, window, arguments.host)
+    file, port = _foxglove(arguments.foxglove)
+    elsewhere = arguments.record is not None or arguments.serve > 0
+    if "view" not in arguments:  # the command that shows has a window unless told otherwise
+        elsewhere |= arguments.foxglove is not None
+    window = window and not elsewhere
+    return ViewOptions(arguments.record, arguments.serve, window, arguments.host, file, port)
+
+
+def _foxglove(text: str | None) -> tuple[Path | None, int]:
+    """The file, or the port, of --foxglove."""
+    from bmask_slam.graph.errors import InputError
+
+    if text is None:
+        return None, 0
+    if text.lower().endswith(".mcap"):
+        return Path(text), 0
+    if text.isdecimal() and 0 < int(text) < 65536:
+        return None, int(text)
+    raise InputError(f"--foxglove {text}: give a port, or a file that ends with .mcap")
 
 
 def format_summary(rows: list[Row]) -> str:

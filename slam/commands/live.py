@@ -42,8 +42,9 @@ of their own. The run folder is that of `run`, with health.json, which is rewrit
 
 SENSORS = ("imu", "odometry", "position", "accelerometer")
 SOURCE_HELP = """\
-recording in any layout of docs/data.md, ROS 1 .bag, ROS 2 bag folder, .mcap, realsense: for the
-RealSense that is plugged in, opencv:N for device N of OpenNI 2, or ros2: (ros2:DOMAIN)"""
+recording in any layout of docs/data.md, ROS 1 .bag, ROS 2 bag folder, .mcap; a camera that is
+plugged in: realsense:, oak:, azure:, record3d:, opencv:N (device N of OpenNI 2); or ros2:
+(ros2:DOMAIN)"""
 
 
 def add_live(commands: Commands) -> None:
@@ -131,8 +132,8 @@ def _live(arguments: argparse.Namespace) -> int:
                 ros2.deliver = slam.add_measurements
             for measured in measured_beside(arguments, options.images, config):
                 slam.add_measurements(measured)
-            if slam.viewer_url:
-                print(f"in a browser: {slam.viewer_url}", file=sys.stderr, flush=True)
+            for address in slam.viewer_addresses:
+                print(address, file=sys.stderr, flush=True)
             told = PlayOptions(not source.waits, quiet=arguments.quiet)
             ended_by = play(slam, source, told, ros2_listener(arguments, ros2))
     found: dict[str, Any] = {

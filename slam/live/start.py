@@ -21,7 +21,7 @@ from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.viewer.scene import ViewOptions
+from bmask_slam.viewer.options import ViewOptions
 
 if TYPE_CHECKING:
     from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
