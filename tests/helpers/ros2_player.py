@@ -17,9 +17,10 @@ import numpy as np
 from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.graph.geometry import inverse, make_pose, rotation_from_quaternion, se3_exp
-from bmask_slam.live.ros2.dds import LATCHED, SENSOR, STATE, Node, idl_struct
-from bmask_slam.live.ros2.messages import header, message, transform, type_name, typestore
+from bmask_slam.live.ros2.dds import DdsNode, idl_struct
+from bmask_slam.live.ros2.messages import header, message, transform, type_name
 from bmask_slam.live.ros2.messages import pose as ros_pose
+from bmask_slam.live.ros2.transport import LATCHED, SENSOR, STATE, typestore
 
 COLOUR, DEPTH = "/camera/camera/color/image_raw", "/camera/camera/aligned_depth_to_color/image_raw"
 INFO, WHEELS = "/camera/camera/color/camera_info", "/odom"
@@ -109,7 +110,7 @@ def _value(kind: Any, rng: np.random.Generator, as_idl: bool) -> Any:
 def main() -> None:
     """Play frames until standard input is closed."""
     domain, rate_hz, out = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
-    node = Node(domain)
+    node = DdsNode(domain)
     image_type = "sensor_msgs/msg/Image"
     colours = node.writer(COLOUR, image_type, SENSOR._replace(reliable=True))
     depths = node.writer(DEPTH, image_type, SENSOR._replace(reliable=True))

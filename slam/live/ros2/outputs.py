@@ -12,7 +12,6 @@ from bmask_slam.graph.arrays import Array, Bytes
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, make_pose, orthonormalised
 from bmask_slam.labelling.results import MapObjects
-from bmask_slam.live.ros2.dds import LATCHED, STATE, Node
 from bmask_slam.live.ros2.messages import (
     header,
     message,
@@ -24,6 +23,7 @@ from bmask_slam.live.ros2.messages import (
     type_name,
 )
 from bmask_slam.live.ros2.objects import detection_array, marker_array
+from bmask_slam.live.ros2.transport import LATCHED, STATE, Node
 from bmask_slam.mapping.products.occupancy import OccupancyGrid
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 

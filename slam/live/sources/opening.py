@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.live.ros2.dds import DdsNode
 from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
 from bmask_slam.live.sources.opencv_camera import OpenCvSource
@@ -60,7 +61,8 @@ def open_source(text: str, options: SourceOptions) -> Source:
     elif text.startswith(OPENCV):
         source = OpenCvSource(_device(text), options.camera, options.silence_s)
     elif text.startswith(ROS2):
-        source = Ros2Source(_domain(text), _of_ros2(options))
+        domain = _domain(text)
+        source = Ros2Source(DdsNode(domain), f"{ROS2}{domain}", ros2_options(options))
     elif is_bag(path):
         source = BagSource(path, options.topics, options.camera, options.realtime)
     elif options.follow:
@@ -83,7 +85,8 @@ def ros2_of(source: Source) -> Ros2Source | None:
     return inner if isinstance(inner, Ros2Source) else None
 
 
-def _of_ros2(options: SourceOptions) -> Ros2Options:
+def ros2_options(options: SourceOptions) -> Ros2Options:
+    """Those of a source's options that are of ROS 2."""
     names = [f.name for f in fields(Ros2Options)]
     return Ros2Options(**{name: getattr(options, name) for name in names})
 

@@ -18,8 +18,8 @@ from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.live.ros2.dds import LATCHED, SENSOR, STATE, Node, Reader
 from bmask_slam.live.ros2.sensors import ImageClock, Ros2Sensors, mounted
+from bmask_slam.live.ros2.transport import LATCHED, SENSOR, STATE, Node, Reader
 from bmask_slam.live.sources.message_frames import message_frames
 from bmask_slam.live.sources.pairing import DEPTH, RGB, Pair, Pairer
 from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
@@ -122,20 +122,22 @@ class Ros2Source(MeasuredSource):
 
     waits = False
 
-    def __init__(self, domain: int, options: Ros2Options) -> None:
+    def __init__(self, node: Node, name: str, options: Ros2Options) -> None:
         """Wait until somebody publishes the images and their camera, and the sensors' topics.
+
+        ``name``, such as ros2:0, is for messages and the run folder.
 
         Raises:
             InputError: nobody does for ``silence_s``, or the camera cannot be used.
         """
-        self.name = "ros2" if domain == 0 else f"ros2-{domain}"
+        self.name = name.replace(":", "-").removesuffix("-0").strip("-")
         self.groundtruth: Trajectory | None = None
         self.counts = SourceCounts()
-        self.node = Node(domain)
+        self.node = node
         self.deliver: Callable[[Measurements], None] = lambda _: None
         self._silence_s = options.silence_s
         self._closed = threading.Event()
-        self._where = f"ros2:{domain}"
+        self._where = name
         self._heard = _Heard(self.node, self._where)
         heard = cast("Bag", self._heard)
         self._topics = self._wait_for_topics(heard, options.topics)

@@ -17,12 +17,12 @@ from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud, MapObjects
 from bmask_slam.live.health import Health
 from bmask_slam.live.ros2 import publisher
-from bmask_slam.live.ros2.dds import typestore
 from bmask_slam.live.ros2.grid import GridOptions, LiveGrid
 from bmask_slam.live.ros2.messages import occupancy_grid
 from bmask_slam.live.ros2.objects import detection_array, marker_array
 from bmask_slam.live.ros2.outputs import OPTICAL, Robot, Ros2Frames
 from bmask_slam.live.ros2.publisher import Ros2Publisher
+from bmask_slam.live.ros2.transport import typestore
 from bmask_slam.mapping.products.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
