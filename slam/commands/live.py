@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from bmask_slam.graph.sensors.streams import Measurements
     from bmask_slam.live.live_slam import LiveOptions, LiveSlam
     from bmask_slam.live.play import Listener
+    from bmask_slam.live.ros2.services import Ros2Services
     from bmask_slam.live.sources.opening import SourceOptions
     from bmask_slam.live.sources.ros2_source import Ros2Source
     from bmask_slam.live.sources.source import Source
@@ -116,15 +117,26 @@ def _sensor_topics(arguments: argparse.Namespace) -> dict[str, str]:
 
 
 def _live(arguments: argparse.Namespace) -> int:
+    from bmask_slam.live.sources.opening import open_source
+
+    with closing(open_source(arguments.source, source_options(arguments))) as source:
+        return live_on(arguments, source)
+
+
+def live_on(arguments: argparse.Namespace, source: Source) -> int:
+    """The command on a source that is open: one run, over ROS 2 others when that is asked for."""
     from bmask_slam.live.live_slam import LiveSlam
     from bmask_slam.live.play import PlayOptions, play
-    from bmask_slam.live.sources.opening import open_source, ros2_of
+    from bmask_slam.live.sources.opening import ros2_of
 
     config = chosen_config(arguments).config
-    with closing(open_source(arguments.source, source_options(arguments))) as source:
-        options, ros2 = _live_options(arguments, source), ros2_of(source)
-        if ros2 is not None:
-            config = replace(config, sensors=ros2.mounted(config.sensors))
+    options, ros2 = _live_options(arguments, source), ros2_of(source)
+    if ros2 is not None:
+        config = replace(config, sensors=ros2.mounted(config.sensors))
+    listener, services = ros2_ends(arguments, ros2)
+    told = PlayOptions(not source.waits, quiet=arguments.quiet)
+    before: Path | None = None
+    while True:
         with LiveSlam(source.camera, config, options) as slam:
             slam.source_counts = source.counts
             if ros2 is not None:
@@ -133,8 +145,28 @@ def _live(arguments: argparse.Namespace) -> int:
                 slam.add_measurements(measured)
             if slam.viewer_url:
                 print(f"in a browser: {slam.viewer_url}", file=sys.stderr, flush=True)
-            told = PlayOptions(not source.waits, quiet=arguments.quiet)
-            ended_by = play(slam, source, told, ros2_listener(arguments, ros2))
+            if services is not None and services.reset_asked:
+                services.begin(before, slam.out)
+            ended_by = play(slam, source, told, listener, services)
+        if ended_by or services is None or not services.reset_asked:
+            return _tell(arguments, slam, source, ended_by)
+        before, options = slam.out, _next_run(options)
+
+
+def _next_run(options: LiveOptions) -> LiveOptions:
+    """Those of a run that begins where another has ended: with a folder of its own."""
+    from bmask_slam.run_folder.open_files import free_run_path
+
+    assert options.out is not None
+    return replace(
+        options, out=free_run_path(options.out.name, options.out.parent), overwrite=False
+    )
+
+
+def _tell(
+    arguments: argparse.Namespace, slam: LiveSlam, source: Source, ended_by: int | None
+) -> int:
+    """Print what came of a run; returns the exit code."""
     found: dict[str, Any] = {
         "folder": slam.out,
         "calibration": slam.calibration,
@@ -169,14 +201,17 @@ def measured_beside(
     )
 
 
-def ros2_listener(arguments: argparse.Namespace, source: Ros2Source | None) -> Listener | None:
-    """What publishes the results, where the frames come from ROS 2."""
+def ros2_ends(
+    arguments: argparse.Namespace, source: Ros2Source | None
+) -> tuple[Listener | None, Ros2Services | None]:
+    """What publishes the results and what serves calls, where the frames come from ROS 2."""
     from bmask_slam.config.configuration import resolve
     from bmask_slam.live.ros2.outputs import OPTICAL, Robot, Ros2Frames
     from bmask_slam.live.ros2.publisher import Ros2Publisher
+    from bmask_slam.live.ros2.services import Ros2Services
 
     if source is None:
-        return None
+        return None, None
     frames = resolve(Ros2Frames, arguments.ros2_params)
     T, by_tf = frames.T_base_camera, False
     if T is None:
@@ -190,7 +225,8 @@ def ros2_listener(arguments: argparse.Namespace, source: Ros2Source | None) -> L
         source.sensors.T_odom_base if wheels else None,
         source.ros_time,
     )
-    return Ros2Publisher(source.node, frames, robot)
+    publisher = Ros2Publisher(source.node, frames, robot)
+    return publisher, Ros2Services(source.node, frames.prefix)
 
 
 def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:

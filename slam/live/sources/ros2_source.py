@@ -136,7 +136,7 @@ class Ros2Source(MeasuredSource):
         self.node = node
         self.deliver: Callable[[Measurements], None] = lambda _: None
         self._silence_s = options.silence_s
-        self._closed = threading.Event()
+        self._closed, self._played = threading.Event(), 0
         self._where = name
         self._heard = _Heard(self.node, self._where)
         heard = cast("Bag", self._heard)
@@ -199,9 +199,11 @@ class Ros2Source(MeasuredSource):
 
     def _pairs(self) -> Iterator[Pair[Any]]:
         pairer = self._pairer
+        self._played += 1  # what iterated before ends
+        mine = self._played
         heard_s = time.monotonic()
         broken = 0
-        while not self._closed.is_set():
+        while not self._closed.is_set() and mine == self._played:
             found = []
             for stream, reader in ((RGB, self._readers[0]), (DEPTH, self._readers[1])):
                 for message in reader.take():
@@ -219,7 +221,8 @@ class Ros2Source(MeasuredSource):
                 )
             else:
                 self._closed.wait(POLL_S)
-        yield from pairer.finish()
+        if mine == self._played:
+            yield from pairer.finish()
 
     def _hand_on(self, at_once: bool) -> None:
         """Hand on what was measured: before frames, else from time to time."""
