@@ -16,8 +16,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Bytes, Floats
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud, MapObjects
-from bmask_slam.live.ros2.cloud import LiveCloud
-from bmask_slam.live.ros2.grid import GridOptions, LiveGrid
+from bmask_slam.live.ros2.grid import GridOptions, LiveCloud, LiveGrid
 from bmask_slam.live.ros2.outputs import Robot, Ros2Frames, Ros2Outputs
 from bmask_slam.live.ros2.transport import Node
 from bmask_slam.tracking.results import FrameResult, TrackingStatus

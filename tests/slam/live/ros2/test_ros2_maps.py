@@ -173,12 +173,12 @@ def test_maps_are_published_when_they_are_due(monkeypatch) -> None:
         publish(FrameResult(k, 5 + k / 10, TrackingStatus.OK, np.eye(4), segment), run)
         if k == 0:
             (add,) = run.listeners
-            add(4, room(2.02))
+            add(4, room(2.02), np.zeros((len(room(2.02)), 3), np.uint8))
     assert publish._making is not None
     publish._making.result(10)
     counts = {topic: len(sent) for topic, sent in node.topics.items()}
     assert counts["/bmask_slam/odometry"] == counts["/bmask_slam/pose"] == 79
     assert counts["/bmask_slam/path"] == counts["/diagnostics"] == 8
     assert counts["/bmask_slam/objects"] == counts["/bmask_slam/object_markers"] == 1
-    assert 1 <= counts["/bmask_slam/map"] <= 2
+    assert 1 <= counts["/bmask_slam/map"] == counts["/bmask_slam/cloud"] <= 2
     assert node.topics["/bmask_slam/map"][-1].info.width > 20

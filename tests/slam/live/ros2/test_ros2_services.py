@@ -24,8 +24,8 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import make_pose, se3_exp, transform
 from bmask_slam.live.messages import MapSaved
 from bmask_slam.live.ros2 import services as services_module
-from bmask_slam.live.ros2.cloud import LiveCloud
 from bmask_slam.live.ros2.dds import CALL_BYTES, HEADER_BYTES, DdsService, carried_type
+from bmask_slam.live.ros2.grid import LiveCloud
 from bmask_slam.live.ros2.outputs import Robot, Ros2Frames
 from bmask_slam.live.ros2.publisher import Ros2Publisher
 from bmask_slam.live.ros2.services import SAVE_S, Ros2Services
