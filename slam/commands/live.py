@@ -50,7 +50,7 @@ RealSense that is plugged in, opencv:N for device N of OpenNI 2, or ros2: (ros2:
 def add_live(commands: Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser("live", help=TEXT, description=f"{TEXT}. {MORE}")
-    parser.set_defaults(handler=_live)
+    parser.set_defaults(handler=_live, ros2_node=None)  # a program with a node of its own sets it
     parser.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
     parser.add_argument("--out", type=Path, help="run folder (default: runs/<source>, numbered)")
     parser.add_argument("--overwrite", action="store_true", help="replace the run that --out holds")
@@ -109,6 +109,7 @@ def source_options(arguments: argparse.Namespace) -> SourceOptions:
         topics=bag_topics(arguments),
         reliable=arguments.reliable,
         sensors=sensors,
+        node=arguments.ros2_node,
     )
 
 
@@ -120,10 +121,10 @@ def _live(arguments: argparse.Namespace) -> int:
     from bmask_slam.live.sources.opening import open_source
 
     with closing(open_source(arguments.source, source_options(arguments))) as source:
-        return live_on(arguments, source)
+        return _live_on(arguments, source)
 
 
-def live_on(arguments: argparse.Namespace, source: Source) -> int:
+def _live_on(arguments: argparse.Namespace, source: Source) -> int:
     """The command on a source that is open: one run, over ROS 2 others when that is asked for."""
     from bmask_slam.live.live_slam import LiveSlam
     from bmask_slam.live.play import PlayOptions, play

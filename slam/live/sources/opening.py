@@ -8,6 +8,7 @@ from pathlib import Path
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.ros2.dds import DdsNode
+from bmask_slam.live.ros2.transport import Node
 from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
 from bmask_slam.live.sources.opencv_camera import OpenCvSource
@@ -36,6 +37,7 @@ class SourceOptions:
         topics: of a bag, or of ROS 2.
         reliable: ROS 2 sends images again that are lost.
         sensors: topics of ROS 2.
+        node: takes part in ROS 2, in place of one of DDS.
     """
 
     camera: Path | None = None
@@ -46,6 +48,7 @@ class SourceOptions:
     topics: BagTopics = field(default_factory=BagTopics)
     reliable: bool = False
     sensors: SensorTopics = field(default_factory=SensorTopics)
+    node: Node | None = None
 
 
 def open_source(text: str, options: SourceOptions) -> Source:
@@ -62,7 +65,8 @@ def open_source(text: str, options: SourceOptions) -> Source:
         source = OpenCvSource(_device(text), options.camera, options.silence_s)
     elif text.startswith(ROS2):
         domain = _domain(text)
-        source = Ros2Source(DdsNode(domain), f"{ROS2}{domain}", ros2_options(options))
+        node = options.node or DdsNode(domain)
+        source = Ros2Source(node, f"{ROS2}{domain}", _of_ros2(options))
     elif is_bag(path):
         source = BagSource(path, options.topics, options.camera, options.realtime)
     elif options.follow:
@@ -85,8 +89,7 @@ def ros2_of(source: Source) -> Ros2Source | None:
     return inner if isinstance(inner, Ros2Source) else None
 
 
-def ros2_options(options: SourceOptions) -> Ros2Options:
-    """Those of a source's options that are of ROS 2."""
+def _of_ros2(options: SourceOptions) -> Ros2Options:
     names = [f.name for f in fields(Ros2Options)]
     return Ros2Options(**{name: getattr(options, name) for name in names})
 
