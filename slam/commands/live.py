@@ -29,6 +29,7 @@ from bmask_slam.graph.errors import InputError
 if TYPE_CHECKING:
     from bmask_slam.graph.sensors.streams import Measurements
     from bmask_slam.live.live_slam import LiveOptions, LiveSlam
+    from bmask_slam.live.network.workstation import Workstation
     from bmask_slam.live.play import Listener
     from bmask_slam.live.ros2.services import Ros2Services
     from bmask_slam.live.sources.opening import SourceOptions
@@ -41,6 +42,9 @@ MORE = """\
 Tracking is here; the map with its graph and loops, segmentation and the dense map have processes
 of their own. The run folder is that of `run`, with health.json, which is rewritten every second."""
 
+WORKSTATION = """\
+Has the map and makes the masks for robots that run `bmask-slam live SOURCE --workstation HOST`.
+Only who knows the token is served, and can then run code here. What is sent is not encrypted."""
 SENSORS = ("imu", "odometry", "position", "accelerometer")
 SOURCE_HELP = """\
 recording in any layout of docs/data.md, ROS 1 .bag, ROS 2 bag folder, .mcap, realsense: for the
@@ -60,6 +64,9 @@ def add_live(commands: Commands) -> None:
         help="play a recording at its own speed, dropping frames that there is no time for",
     )
     _add_source_arguments(parser)
+    text = "machine that has the map and makes the masks: bmask-slam workstation runs there"
+    parser.add_argument("--workstation", metavar="HOST[:PORT]", help=text)
+    _add_token_argument(parser)
     add_config_arguments(parser)
     add_camera_argument(parser)
     text = "find readout, depth delay and bend while it runs; auto, the default: use them"
@@ -71,6 +78,45 @@ def add_live(commands: Commands) -> None:
     parser.add_argument("--view", action="store_true", help="show it in Rerun's window")
     add_view_arguments(parser)
     add_output_arguments(parser, "the run folder's path")
+
+
+def add_workstation(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "workstation",
+        help="have map and masks for a robot that runs live --workstation",
+        description=WORKSTATION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(handler=_workstation)
+    text = "address to listen on (default: 127.0.0.1, for this machine only)"
+    parser.add_argument("--host", default="127.0.0.1", help=text)
+    parser.add_argument("--port", type=int, default=7717, help="(default: 7717)")
+    _add_token_argument(parser)
+
+
+def _add_token_argument(parser: argparse.ArgumentParser) -> None:
+    text = "secret that robot and workstation share (default: ~/.config/bmask-slam/token)"
+    parser.add_argument("--token-file", type=Path, metavar="F", help=text)
+
+
+def _workstation(arguments: argparse.Namespace) -> int:
+    from bmask_slam.live.network.connection import default_token_file, make_token, read_token
+    from bmask_slam.live.network.server import WorkstationServer
+    from bmask_slam.runtime.stop_request import StopRequest
+
+    path = arguments.token_file or default_token_file()
+    if not path.exists():
+        make_token(path)
+        print(f"a new token is in {path}; copy it to the robot", file=sys.stderr)
+    if not 0 <= arguments.port < 1 << 16:
+        raise InputError(f"--port {arguments.port}: no port")
+    server = WorkstationServer(arguments.host, arguments.port, read_token(path))
+    print(f"listening on {arguments.host}:{server.port}; Ctrl-C ends it", flush=True)
+    with StopRequest() as stop:
+        server.serve(lambda: stop.signal is not None)
+    server.close()
+    return 128 + stop.signal if stop.signal else 0
 
 
 def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
@@ -256,7 +302,18 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
         calibrate=arguments.calibrate,
         straightens=True,
         interpolates=source.interpolates,
+        workstation=_workstation_of(arguments),
     )
+
+
+def _workstation_of(arguments: argparse.Namespace) -> Workstation | None:
+    from bmask_slam.live.network.workstation import Workstation
+
+    if arguments.workstation is None:
+        return None
+    if arguments.ray:
+        raise InputError("--ray: the masks are made on the workstation; leave one of both out")
+    return Workstation.of(arguments.workstation, arguments.token_file)
 
 
 def _summary(slam: LiveSlam, source: Source) -> str:
