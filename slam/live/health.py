@@ -43,6 +43,7 @@ class Health:
             started again.
         workstation: "connected", "away" while it cannot be reached, "" for none.
         workstation_losses: how often it was lost.
+        workstation_sent_bytes, workstation_received_bytes: what went there and came from there.
         source: what the source counted, by name.
     """
 
@@ -70,6 +71,8 @@ class Health:
     dense_deaths: int = 0
     workstation: str = ""
     workstation_losses: int = 0
+    workstation_sent_bytes: int = 0
+    workstation_received_bytes: int = 0
     source: dict[str, int] = field(default_factory=dict)
 
     def as_json(self) -> str:
@@ -171,5 +174,7 @@ def measure_health(
         dense_deaths=dense.worker.crashes if dense else 0,
         workstation=remote.worker.workstation,
         workstation_losses=remote.worker.losses,
+        workstation_sent_bytes=remote.worker.traffic[0],
+        workstation_received_bytes=remote.worker.traffic[1],
         source=asdict(source),
     )

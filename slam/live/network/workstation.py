@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import socket
+import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import MapSaved
 from bmask_slam.live.network.carrying import FilePiece, Outbox, store
 from bmask_slam.live.network.connection import (
+    BEAT_S,
     Connection,
     default_token_file,
     introduce,
@@ -26,8 +29,10 @@ from bmask_slam.live.processes.worker import Failure
 logger = logging.getLogger(__name__)
 
 PORT = 7717
-CONNECT_S = 5.0
+CONNECT_S = 2.0
 STOP_S = 0.1
+SILENT_S = 1.5
+"""A machine that acknowledges nothing for so long is away. Much longer, and tracking is lost."""
 
 
 @dataclass
@@ -121,10 +126,19 @@ class DistantEnd:
         self._channel = Channel(connection, None, Outbox())
         self._failed = False
         self._channel.send(first)
+        threading.Thread(target=self._beat, name="beat", daemon=True).start()
+
+    def _beat(self) -> None:
+        with suppress(OSError):
+            while self._channel.open:
+                self._connection.beat()
+                time.sleep(BEAT_S)
 
     @property
     def is_running(self) -> bool:
-        """Whether the connection is open."""
+        """Whether the connection is open, and the other machine acknowledges what is sent."""
+        if self._channel.open and self._connection.silent_s > SILENT_S:
+            self._channel.close()
         return self._channel.open
 
     @property

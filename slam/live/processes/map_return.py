@@ -19,7 +19,7 @@ from bmask_slam.live.processes.worker import WorkerEnd, Workstation
 
 logger = logging.getLogger(__name__)
 
-RETRY_S = 3.0
+RETRY_S = 1.0
 """Between two tries to reach the workstation."""
 SAVE_S = START_S = 300.0
 """Longest waits for the state, and for a process there to have read it."""

@@ -8,6 +8,7 @@ process is one of this machine, and when it is back, the map goes there again (`
 
 from __future__ import annotations
 
+import itertools
 import logging
 import time
 from collections.abc import Callable
@@ -16,7 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import Finish, Ready, Resent, SaveState, Started, StateSaved
+from bmask_slam.live.processes.map_process import serve_map
 from bmask_slam.live.processes.map_return import MapReturn
 from bmask_slam.live.processes.supervision import late_start_text
 from bmask_slam.live.processes.worker import Failure, Worker, WorkerEnd, Workstation
@@ -24,6 +27,7 @@ from bmask_slam.live.processes.worker import Failure, Worker, WorkerEnd, Worksta
 logger = logging.getLogger(__name__)
 
 TARGET = "bmask_slam.live.processes.map_process:serve_map"
+STANDBY = "bmask_slam.live.processes.map_worker:serve_later"
 MAX_CRASHES = 3
 """Number of crashes after which it is not restarted, if it never got as far as before between."""
 
@@ -67,6 +71,7 @@ class MapWorker:
         self.saves = self._saved = 0  # messages that the last state contains
         self._return: MapReturn | None = None
         self._early: list[Any] = []
+        self._standby: WorkerEnd | None = None  # in place of the workstation
         self._journal: dict[int, Any] = {}
         self._number = 0
         self._crashes_in_a_row = 0
@@ -80,6 +85,12 @@ class MapWorker:
         if self._place.workstation is None:
             return ""
         return "connected" if self._return is None else "away"
+
+    @property
+    def traffic(self) -> tuple[int, int]:
+        """Bytes to the workstation and from it."""
+        there = self._place.workstation
+        return (0, 0) if there is None else (there.traffic.sent_bytes, there.traffic.received_bytes)
 
     @property
     def pid(self) -> int:
@@ -125,6 +136,7 @@ class MapWorker:
         begin, self._return = self._return.saved or 0, None
         self._worker.kill()
         last = self._without_own(self._worker.receive())
+        self._standby = Worker("map", STANDBY)
         self._worker, self._early = workstation, self._without_own(early)
         self._resent = self._number
         self._worker.send((0, Resent(self._number)))
@@ -190,7 +202,11 @@ class MapWorker:
         """Start a process here and send it what no saved state contains."""
         self._resent = self._number
         arguments = (*self._arguments, self.state, self._resent)
-        self._worker = Worker("map", TARGET, *arguments)
+        if self._standby is not None:
+            self._worker, self._standby = self._standby, None
+            self._worker.send(arguments)
+        else:
+            self._worker = Worker("map", TARGET, *arguments)
         if self._place.workstation is not None:
             if self._return is not None:
                 self._return.close()
@@ -211,11 +227,15 @@ class MapWorker:
         """End the process at once."""
         if self._return is not None:
             self._return.close()
+        if self._standby is not None:
+            self._standby.kill()
         self._worker.kill()
 
     def _first(self) -> WorkerEnd:
         if self._place.workstation is not None:
-            return self._place.workstation.worker("map", (*self._arguments, 0), None)
+            there = self._place.workstation.worker("map", (*self._arguments, 0), None)
+            self._standby = Worker("map", STANDBY)
+            return there
         return Worker("map", TARGET, *self._arguments, None, 0)
 
     def _without_own(self, messages: list[Any]) -> list[Any]:
@@ -256,3 +276,9 @@ class MapWorker:
         logger.error("message %d, %s, is skipped", number, type(message).__name__)
         if (instead := self._replacement(message)) is not None:
             self._journal[number] = instead
+
+
+def serve_later(channel: Channel) -> None:
+    """Wait, with everything loaded, for the other arguments of ``serve_map``; then do that."""
+    for arguments in itertools.islice(channel.messages(), 1):
+        serve_map(channel, *arguments)

@@ -57,8 +57,20 @@ class WorkerEnd(Protocol):
     def kill(self) -> None: ...
 
 
+class Traffic(Protocol):
+    """Bytes to a workstation and from it."""
+
+    @property
+    def sent_bytes(self) -> int: ...
+    @property
+    def received_bytes(self) -> int: ...
+
+
 class Workstation(Protocol):
     """Another machine that runs workers."""
+
+    @property
+    def traffic(self) -> Traffic: ...
 
     def worker(self, name: str, arguments: tuple[Any, ...], state: Path | None) -> WorkerEnd:
         """Start one by its name, from a file of this machine if there is one.
