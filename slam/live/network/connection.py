@@ -26,13 +26,15 @@ PROTOCOL = 1
 HELLO_BYTES, NONCE_BYTES, CODE_BYTES = 64, 32, 32
 MIN_TOKEN = 20
 MAX_PARTS = 1 << 16
-DEAD_S = 5
-"""A connection of which nothing is acknowledged for so long has ended, as the system sees it."""
+DEAD_S = 60
+"""A connection of which nothing is acknowledged for so long has ended, as the system sees it. That
+counts a process that reads nothing for so long, as one that is being loaded."""
 BEAT_S = 0.3
 """Between two empty messages of the robot, which the other machine's system acknowledges, also
 while its process works."""
-_LAST_ACKNOWLEDGED = 8 + 12 * 4
-"""Where Linux's struct tcp_info has the milliseconds since the last acknowledgement."""
+_RETRANSMITS, _LAST_ACKNOWLEDGED = 2, 8 + 12 * 4
+"""Where Linux's struct tcp_info has how often the same was sent again, and the milliseconds since
+the last acknowledgement."""
 _SMALL = 512
 """Bytes up to which a part is not compressed."""
 _COUNT, _SIZES = struct.Struct("!I"), struct.Struct("!QQ")
@@ -159,10 +161,15 @@ class Connection:
 
     @property
     def silent_s(self) -> float:
-        """Time since the other system acknowledged something; 0 where this one does not say."""
+        """For how long the other system has acknowledged nothing of what was sent again.
+
+        0 where this system does not say, and while what was sent has arrived, but is not read.
+        """
         try:
             info = self._end.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 104)
         except (OSError, AttributeError):
+            return 0.0
+        if not info[_RETRANSMITS]:
             return 0.0
         return int.from_bytes(info[_LAST_ACKNOWLEDGED:][:4], sys.byteorder) / 1e3
 
