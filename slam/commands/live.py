@@ -30,10 +30,7 @@ if TYPE_CHECKING:
     from bmask_slam.graph.sensors.streams import Measurements
     from bmask_slam.live.live_slam import LiveOptions, LiveSlam
     from bmask_slam.live.network.workstation import Workstation
-    from bmask_slam.live.play import Listener
-    from bmask_slam.live.ros2.services import Ros2Services
     from bmask_slam.live.sources.opening import SourceOptions
-    from bmask_slam.live.sources.ros2_source import Ros2Source
     from bmask_slam.live.sources.source import Source
     from bmask_slam.system_config import SystemConfig
 
@@ -173,14 +170,14 @@ def _live(arguments: argparse.Namespace) -> int:
 def _live_on(arguments: argparse.Namespace, source: Source) -> int:
     """The command on a source that is open: one run, over ROS 2 others when that is asked for."""
     from bmask_slam.live.live_slam import LiveSlam
-    from bmask_slam.live.play import PlayOptions, play
+    from bmask_slam.live.play import PlayOptions, play, ros2_ends
     from bmask_slam.live.sources.opening import ros2_of
 
     config = chosen_config(arguments).config
     options, ros2 = _live_options(arguments, source), ros2_of(source)
     if ros2 is not None:
         config = replace(config, sensors=ros2.mounted(config.sensors))
-    listener, services = ros2_ends(arguments, ros2)
+    listener, services = (None, None) if ros2 is None else ros2_ends(ros2, arguments.ros2_params)
     told = PlayOptions(not source.waits, quiet=arguments.quiet)
     before: Path | None = None
     while True:
@@ -246,34 +243,6 @@ def measured_beside(
         if given
         else read_folder(folder, config.sensors.enabled)
     )
-
-
-def ros2_ends(
-    arguments: argparse.Namespace, source: Ros2Source | None
-) -> tuple[Listener | None, Ros2Services | None]:
-    """What publishes the results and what serves calls, where the frames come from ROS 2."""
-    from bmask_slam.config.configuration import resolve
-    from bmask_slam.live.ros2.outputs import OPTICAL, Robot, Ros2Frames
-    from bmask_slam.live.ros2.publisher import Ros2Publisher
-    from bmask_slam.live.ros2.services import Ros2Services
-
-    if source is None:
-        return None, None
-    frames = resolve(Ros2Frames, arguments.ros2_params)
-    T, by_tf = frames.T_base_camera, False
-    if T is None:
-        T = source.T_base_camera(frames.base)
-        by_tf = T is not None
-    wheels = "odometry" in source.sensors.names
-    robot = Robot(
-        OPTICAL if T is None else T,
-        T is not None,
-        by_tf,
-        source.sensors.T_odom_base if wheels else None,
-        source.ros_time,
-    )
-    publisher = Ros2Publisher(source.node, frames, robot)
-    return publisher, Ros2Services(source.node, frames.prefix)
 
 
 def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:

@@ -172,9 +172,6 @@ def measure_health(
         map_deaths=remote.worker.crashes,
         segmenter_deaths=segmenter.worker.crashes if segmenter else 0,
         dense_deaths=dense.worker.crashes if dense else 0,
-        workstation=remote.worker.workstation,
-        workstation_losses=remote.worker.losses,
-        workstation_sent_bytes=remote.worker.traffic[0],
-        workstation_received_bytes=remote.worker.traffic[1],
+        **remote.worker.workstation_health(),
         source=asdict(source),
     )

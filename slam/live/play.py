@@ -7,10 +7,16 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Protocol, TypeAlias
 
+from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.live_slam import LiveSlam, Prepared
+from bmask_slam.live.ros2.outputs import OPTICAL, Robot, Ros2Frames
+from bmask_slam.live.ros2.publisher import Ros2Publisher
+from bmask_slam.live.ros2.services import Ros2Services
+from bmask_slam.live.sources.ros2_source import Ros2Source
 from bmask_slam.live.sources.source import Newest, Source
 from bmask_slam.runtime.progress import make_bar
 from bmask_slam.runtime.stop_request import StopRequest
@@ -134,3 +140,25 @@ def _newest(
             yield pair
     finally:
         newest.stop(STOP_S if stop.signal is None else 0.0)
+
+
+def ros2_ends(source: Ros2Source, params: Path | None) -> tuple[Ros2Publisher, Ros2Services]:
+    """What publishes the results to ROS 2, and what serves its calls.
+
+    Args:
+        params: file with `Ros2Frames`, as YAML.
+    """
+    frames = resolve(Ros2Frames, params)
+    T, by_tf = frames.T_base_camera, False
+    if T is None:
+        T = source.T_base_camera(frames.base)
+        by_tf = T is not None
+    wheels = "odometry" in source.sensors.names
+    robot = Robot(
+        OPTICAL if T is None else T,
+        T is not None,
+        by_tf,
+        source.sensors.T_odom_base if wheels else None,
+        source.ros_time,
+    )
+    return Ros2Publisher(source.node, frames, robot), Ros2Services(source.node, frames.prefix)

@@ -19,11 +19,18 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.graph.arrays import Bytes
+from bmask_slam.graph.files.reading import read_bytes
 from bmask_slam.live.channel import END, Channel
 from bmask_slam.live.messages import Finish, MapSaved, SaveMap, SaveState, StateSaved
 
+MAX_BYTES = 1 << 40
 PIECE = 1 << 18
 """Bytes of a piece: what another message waits for at most."""
+
+
+def file_data(path: Path) -> Bytes:
+    """The bytes of a file that this program has just written. Raises InputError: it is gone."""
+    return np.frombuffer(read_bytes(path, "run it again", MAX_BYTES), np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +105,7 @@ class CarriedFiles:
         if isinstance(message, MapSaved) and message.failure:
             self._channel.send(told)
             return
-        data = np.fromfile(message.path, np.uint8)
+        data = file_data(message.path)
         for begin in range(0, max(len(data), 1), PIECE):
             end = begin + PIECE
             last = told if end >= len(data) else None

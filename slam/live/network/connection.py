@@ -21,10 +21,11 @@ from pathlib import Path
 
 from bmask_slam import __version__
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.reading import read_bytes
 
 PROTOCOL = 1
 HELLO_BYTES, NONCE_BYTES, CODE_BYTES = 64, 32, 32
-MIN_TOKEN = 20
+MIN_TOKEN, MAX_TOKEN = 20, 4096
 MAX_PARTS = 1 << 16
 DEAD_S = 60
 """A connection of which nothing is acknowledged for so long has ended, as the system sees it. That
@@ -60,13 +61,11 @@ def read_token(path: Path) -> bytes:
     Raises:
         InputError: there is none, or it is too short to be safe.
     """
-    try:
-        token = path.read_bytes()[:4096].strip()
-    except OSError as error:
-        raise InputError(
-            f"{path}: {error.strerror}; copy the token of the workstation to it, which "
-            "bmask-slam workstation makes at its first start"
-        ) from error
+    cure = (
+        "copy the token of the workstation to it, which bmask-slam workstation makes at its first "
+        "start"
+    )
+    token = read_bytes(path, cure, MAX_TOKEN).strip()
     if len(token) < MIN_TOKEN:
         raise InputError(f"{path}: a token of fewer than {MIN_TOKEN} characters is not safe")
     return token

@@ -11,12 +11,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import MapSaved
-from bmask_slam.live.network.carrying import FilePiece, Outbox, store
+from bmask_slam.live.network.carrying import FilePiece, Outbox, file_data, store
 from bmask_slam.live.network.connection import (
     BEAT_S,
     Connection,
@@ -112,7 +110,7 @@ class Workstation:
                 "bmask-slam workstation --host ADDRESS run there?"
             ) from error
         self.traffic.connections.append(connection)
-        data = None if state is None else np.fromfile(state, np.uint8)
+        data = None if state is None else file_data(state)
         return DistantEnd(connection, (name, arguments, data))
 
 

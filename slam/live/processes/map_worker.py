@@ -86,11 +86,14 @@ class MapWorker:
             return ""
         return "connected" if self._return is None else "away"
 
-    @property
-    def traffic(self) -> tuple[int, int]:
-        """Bytes to the workstation and from it."""
+    def workstation_health(self) -> dict[str, Any]:
+        """What ``Health`` says of the workstation."""
         there = self._place.workstation
-        return (0, 0) if there is None else (there.traffic.sent_bytes, there.traffic.received_bytes)
+        sent, received = (
+            (there.traffic.sent_bytes, there.traffic.received_bytes) if there else (0, 0)
+        )
+        found: dict[str, Any] = {"workstation": self.workstation, "workstation_losses": self.losses}
+        return found | {"workstation_sent_bytes": sent, "workstation_received_bytes": received}
 
     @property
     def pid(self) -> int:
