@@ -128,7 +128,7 @@ def play(node: FakeNode, ended: threading.Event, told: dict[str, Any]) -> None:
 
 
 def test_the_node_tracks_and_serves(modules, tmp_path: Path) -> None:
-    options = ["--segmenter", "none", "--calibrate", "off", "--max-frames", "12"]
+    options = ["--segmenter", "none", "--calibrate", "off", "--max-frames", "30"]
     out = tmp_path / "run"
     given = {
         "options": [*options, "--out", str(out)],

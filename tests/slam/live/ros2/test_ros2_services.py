@@ -33,7 +33,7 @@ from bmask_slam.live.ros2.transport import encoded, typestore
 from bmask_slam.run_folder.map_file import read_map
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
-DOMAIN, FRAMES = 78, 14
+DOMAIN, FRAMES = 78, 50
 TRIGGER, SET_BOOL = (typestore().types[f"std_srvs/srv/{n}_Request"] for n in ("Trigger", "SetBool"))
 
 
@@ -161,7 +161,7 @@ def test_a_second_process_calls_each_service(tmp_path: Path, monkeypatch) -> Non
     helpers = Path(__file__).parents[3] / "helpers"
     path = os.pathsep.join([str(helpers), *filter(None, sys.path)])
     calls = ["localise_only=on", "save_map", "localise_only=off", "reset"]
-    words = [sys.executable, helpers / "ros2_player.py", DOMAIN, 15, tmp_path / "heard", *calls]
+    words = [sys.executable, helpers / "ros2_player.py", DOMAIN, 20, tmp_path / "heard", *calls]
     env = {**os.environ, "PYTHONPATH": path}
     with subprocess.Popen(list(map(str, words)), env=env, stdin=subprocess.PIPE) as player:
         out = tmp_path / "run"
