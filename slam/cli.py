@@ -23,7 +23,7 @@ from bmask_slam import __version__
 from bmask_slam.commands.calibrate import add_calibrate
 from bmask_slam.commands.compare import add_compare
 from bmask_slam.commands.evaluate import add_evaluate
-from bmask_slam.commands.live import add_live
+from bmask_slam.commands.live import add_live, add_workstation
 from bmask_slam.commands.map import add_map, add_merge
 from bmask_slam.commands.optimise import add_optimise
 from bmask_slam.commands.results import add_export, add_query
@@ -39,6 +39,7 @@ from bmask_slam.runtime.stop_request import SIGNALS
 ADDED = (
     add_run,
     add_live,
+    add_workstation,
     add_evaluate,
     add_render,
     add_convert,

@@ -41,7 +41,7 @@ ROOMS = {
     "slam/sequences": "[...]  bags  formats  sequence  info  right_images  __init__",
     "slam/run_folder": "[...]  scene  export",
     "slam/rendering": "engine  things  rooms  [...]",
-    "slam/live": """[...]  ros2  sources  processes  system  start  health  display
+    "slam/live": """[...]  ros2  sources  processes  network  system  start  health  display
                     recorder  live_map  live_slam  play""",
     "slam/live/sources": "[...]  cameras  opening",
     "slam/comparison": "experiment  jobs  statistics  report  [...]",

@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +28,7 @@ from bmask_slam.live.messages import (
     UseCamera,
 )
 from bmask_slam.live.processes.map_process import LabelsOnly
+from bmask_slam.live.processes.map_worker import MapPlace
 from bmask_slam.live.processes.remote_calibration import RemoteCalibration
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
@@ -87,7 +87,7 @@ class LiveSystem(SlamSystem):
         self,
         camera: Camera,
         config: SystemConfig,
-        folder: Path,
+        place: MapPlace,
         segmenter: RemoteSegmenter | None = None,
         dense: RemoteDenseMapper | None = None,
         calibration: RemoteCalibration | None = None,
@@ -99,7 +99,7 @@ class LiveSystem(SlamSystem):
         self.label_names = (segmenter or NoSegmenter).labels.names
         self.mask_listeners: list[Callable[[Masks], None]] = []
         with ExitStack() as undo:
-            self.remote = RemoteMapper(camera, config, self.label_names, folder)
+            self.remote = RemoteMapper(camera, config, self.label_names, place)
             undo.callback(self.remote.close)
             super().__init__(camera, config, back_end=self.remote)
             self.remote.wait_until_ready(RestartPolicy().start_s)

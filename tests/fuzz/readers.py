@@ -59,8 +59,8 @@ from bmask_slam.graph.trajectory_formats import (
     write_euroc,
     write_kitti,
 )
-from bmask_slam.live.ros2.dds import decoded, typestore
 from bmask_slam.live.ros2.sensors import ImageClock, Ros2Sensors
+from bmask_slam.live.ros2.transport import decoded, typestore
 from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
 from bmask_slam.mapping.inverse_depth.depth_map import DEPTH_FILE, read_depth_map

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.live.ros2.dds import DdsNode
+from bmask_slam.live.ros2.transport import Node
 from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.cameras.azure_camera import AzureSource
 from bmask_slam.live.sources.cameras.oak_camera import OakSource
@@ -39,6 +41,7 @@ class SourceOptions:
         topics: of a bag, or of ROS 2.
         reliable: ROS 2 sends images again that are lost.
         sensors: topics of ROS 2.
+        node: takes part in ROS 2, in place of one of DDS.
     """
 
     camera: Path | None = None
@@ -49,6 +52,7 @@ class SourceOptions:
     topics: BagTopics = field(default_factory=BagTopics)
     reliable: bool = False
     sensors: SensorTopics = field(default_factory=SensorTopics)
+    node: Node | None = None
 
 
 def open_source(text: str, options: SourceOptions) -> Source:
@@ -62,7 +66,9 @@ def open_source(text: str, options: SourceOptions) -> Source:
     if (camera := _camera(text, options)) is not None:
         source = camera
     elif text.startswith(ROS2):
-        source = Ros2Source(_domain(text), _of_ros2(options))
+        domain = _domain(text)
+        node = options.node or DdsNode(domain)
+        source = Ros2Source(node, f"{ROS2}{domain}", _of_ros2(options))
     elif is_bag(path):
         source = BagSource(path, options.topics, options.camera, options.realtime)
     elif options.follow:
