@@ -12,6 +12,7 @@ from bmask_slam.back_end.config import BackEndConfig
 from bmask_slam.back_end.map_backend import MapBackend
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.features.brisk import BriskExtractor, Features
+from bmask_slam.features.marker_detection import MarkerDetector
 from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import fitting, nested, part
@@ -44,6 +45,7 @@ class SlamSystem(SensorSystem):
         moving_objects: keeps what moves out of tracking and out of the map.
         keyframes: decides which frames stay in the map.
         semantics: labels landmarks and finds objects.
+        markers: finds fiducial markers in keyframes; None where they are not looked for.
         stage_ms: wall time of each stage of the last frame, in milliseconds.
     """
 
@@ -78,6 +80,8 @@ class SlamSystem(SensorSystem):
         self.semantics = SemanticMapper(
             camera, config.semantics, self.map, segmenter, self.moving_objects.observe_masks
         )
+        markers = config.sensors.markers
+        self.markers = MarkerDetector(markers, config.features) if markers.enabled else None
         self.stage_ms: dict[str, float] = {}
         self._first_keyframe = 0  # of this session
 
@@ -235,6 +239,8 @@ class SlamSystem(SensorSystem):
         reason = "" if restored else self.keyframes.reason(tracked)
         if not reason:
             return tracked, None, ""
+        if self.markers is not None:
+            self.map.add_measurements(self.markers.detect(frame, self.camera))
         return *self.insert(frame, tracked, self.camera_tracker.local_ids), reason
 
     @stage("graph")

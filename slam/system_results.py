@@ -27,7 +27,7 @@ from bmask_slam.run_folder.covariance_file import (
 )
 from bmask_slam.run_folder.map_file import MAP, SavedRun, write_map
 from bmask_slam.run_folder.semantic_files import semantic_writers
-from bmask_slam.sensing.sensor_fusion import example_state
+from bmask_slam.sensing.carried_frames import example_state
 from bmask_slam.system_config import SystemConfig
 
 OLDER_ARRAYS = ("semantics.labels.counts", "semantics.objects.labels.counts")

@@ -1,0 +1,90 @@
+"""Loops by fiducial markers: one that is seen again where the map can have drifted moves the map.
+
+The sighting enters without a robust kernel, so that it moves the map however far that has drifted.
+If it fits afterwards, it gets the kernel of all others, and the landmarks of both sides are fused;
+if not, the marker was moved, and the sighting leaves the graph again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from bmask_slam.events import EventLog
+from bmask_slam.graph.arrays import no_pairs
+from bmask_slam.graph.factors.checks import chi2_quantile
+from bmask_slam.graph.factors.graph_update import MARKER
+from bmask_slam.graph.smoother.smoother import Smoother
+from bmask_slam.loops.closing import LoopCloser
+from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.sensing.marker_fusion import PROBABILITY
+from bmask_slam.sensing.marker_sightings import Sighting, Verdict, sightings_of
+from bmask_slam.sensing.sensor_fusion import SensorFusion
+
+
+class MapOwner(Protocol):
+    """Has the graph, sensors and loops, and changes them; `back_end.mapper.Mapper` does."""
+
+    smoother: Smoother
+    sensors: SensorFusion
+    loops: LoopCloser
+    events: EventLog
+
+    def change_graph(self, **changes: Any) -> None:
+        """Change the graph, and iterate until it converges."""
+
+    def fuse(self, loops: list[LoopConstraint]) -> None:
+        """Fuse the landmarks of both sides of loops."""
+
+
+def close_marker_loops(mapper: MapOwner) -> None:
+    """Close the loops of sightings that wait, or refuse them."""
+    markers, smoother = mapper.sensors.markers, mapper.smoother
+    waiting, markers.waiting = markers.waiting, []
+    known = smoother.tables.keyframes.ids
+    waiting = [s for s in waiting if np.isin(s.factor.keyframe_ids, known).all()]
+    if not waiting:
+        return
+    ends = [_older_end(mapper, s) for s in waiting]
+    mapper.change_graph(relative_poses=tuple(replace(s.factor, robust=None) for s in waiting))
+    wrong = _wrong(mapper, waiting)
+    for sighting in waiting:
+        moved = sighting.factor.name in wrong
+        mapper.sensors.keep_verdict(sighting.factor.name, Verdict.MOVED if moved else None)
+        if moved:
+            markers.tell_moved(sighting)
+    kept = [(s, end) for s, end in zip(waiting, ends, strict=True) if s.factor.name not in wrong]
+    names = tuple(s.factor.name for s in waiting)
+    mapper.change_graph(
+        remove_relative_poses=names, relative_poses=tuple(s.factor for s, _ in kept)
+    )
+    loops = [_constraint(s, end) for s, end in kept]
+    for sighting, end in kept:
+        off_m = float(np.linalg.norm(sighting.error[3:]))
+        mapper.events.marker_loop((end, sighting.factor.keyframe_b), sighting.marker, off_m)
+    if loops:
+        mapper.fuse(loops)
+
+
+def _older_end(mapper: MapOwner, sighting: Sighting) -> int:
+    """The newest keyframe that saw the marker before."""
+    earlier = sightings_of(mapper.smoother.tables, sighting.factor.keyframe_a)
+    return max(f.keyframe_b for f in earlier)
+
+
+def _wrong(mapper: MapOwner, waiting: list[Sighting]) -> set[tuple[int, int, str]]:
+    """Names of the sightings that do not fit the graph now, where they may move it freely."""
+    errors = mapper.smoother.relative_pose_errors(
+        MARKER, lambda T: mapper.loops.noise.map_covariances(np.zeros((len(T), 2)))
+    )
+    misfit = errors.chi2 > chi2_quantile(PROBABILITY, 6)
+    pairs = zip(errors.keyframe_a[misfit].tolist(), errors.keyframe_b[misfit].tolist(), strict=True)
+    return {(a, b, MARKER) for a, b in pairs} & {s.factor.name for s in waiting}
+
+
+def _constraint(sighting: Sighting, end: int) -> LoopConstraint:
+    """A loop between two keyframes, whose landmarks are fused by projection."""
+    newer = sighting.factor.keyframe_b
+    return LoopConstraint(end, newer, np.eye(4), np.eye(6), 0, 1.0, no_pairs())
