@@ -124,6 +124,36 @@ class MarkerPose:
     degrees: int
 
 
+@dataclass(frozen=True, eq=False)
+class FoundMarker:
+    """A marker in the map.
+
+    Attributes:
+        id: its number in the dictionary.
+        size_m: edge of the black square, known or by depth; NaN of one from another recording.
+        T_world_marker: (4, 4).
+        seen, used: number of keyframes that saw it, and of those whose sighting is a factor.
+    """
+
+    id: int
+    size_m: float
+    T_world_marker: Array
+    seen: int
+    used: int
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerMap:
+    """The markers of a map segment, by rising ids.
+
+    ``T_world_site`` (4, 4) is the frame in which poses of markers were known; None without any.
+    """
+
+    dictionary: str
+    T_world_site: Array | None
+    markers: tuple[FoundMarker, ...]
+
+
 def fit_marker(
     seen: SeenCorners, T_marker_camera: Array, log_size: float, log_size_sigma: float
 ) -> MarkerPose | None:

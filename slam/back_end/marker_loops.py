@@ -14,19 +14,22 @@ import numpy as np
 
 from bmask_slam.events import EventLog
 from bmask_slam.graph.arrays import no_pairs
-from bmask_slam.graph.factors.checks import chi2_quantile
-from bmask_slam.graph.factors.graph_update import MARKER
+from bmask_slam.graph.factors.checks import chi2_quantile, mahalanobis
+from bmask_slam.graph.factors.graph_update import LOOP, MARKER, RelativePoseName
+from bmask_slam.graph.geometry import se3_exp, se3_log
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.loops.closing import LoopCloser
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.sensing.marker_fusion import PROBABILITY
-from bmask_slam.sensing.marker_sightings import Sighting, Verdict, sightings_of
+from bmask_slam.sensing.marker_sightings import MIN_SHARED, Sighting, Verdict, sightings_of
 from bmask_slam.sensing.sensor_fusion import SensorFusion
+from bmask_slam.world.world_map import WorldMap
 
 
 class MapOwner(Protocol):
     """Has the graph, sensors and loops, and changes them; `back_end.mapper.Mapper` does."""
 
+    world: WorldMap
     smoother: Smoother
     sensors: SensorFusion
     loops: LoopCloser
@@ -48,18 +51,22 @@ def close_marker_loops(mapper: MapOwner) -> None:
     if not waiting:
         return
     ends = [_older_end(mapper, s) for s in waiting]
-    mapper.change_graph(relative_poses=tuple(replace(s.factor, robust=None) for s in waiting))
-    wrong = _wrong(mapper, waiting)
+    agreeing, before = _agreeing(mapper, waiting), _misfits(mapper)
+    mapper.change_graph(relative_poses=tuple(replace(s.factor, robust=None) for s in agreeing))
+    misfits, names = _misfits(mapper), {s.factor.name for s in agreeing}
+    spoilt = misfits - before - names  # others fitted, and no longer do
+    wrong = names if spoilt else names & misfits
+    wrong |= {s.factor.name for s in waiting} - {s.factor.name for s in agreeing}
     for sighting in waiting:
         moved = sighting.factor.name in wrong
         mapper.sensors.keep_verdict(sighting.factor.name, Verdict.MOVED if moved else None)
         if moved:
             markers.tell_moved(sighting)
     kept = [(s, end) for s, end in zip(waiting, ends, strict=True) if s.factor.name not in wrong]
-    names = tuple(s.factor.name for s in waiting)
     mapper.change_graph(
-        remove_relative_poses=names, relative_poses=tuple(s.factor for s, _ in kept)
+        remove_relative_poses=tuple(sorted(names)), relative_poses=tuple(s.factor for s, _ in kept)
     )
+    kept = [(s, end) for s, end in kept if not _is_covisible(mapper, end, s.factor.keyframe_b)]
     loops = [_constraint(s, end) for s, end in kept]
     for sighting, end in kept:
         off_m = float(np.linalg.norm(sighting.error[3:]))
@@ -74,14 +81,43 @@ def _older_end(mapper: MapOwner, sighting: Sighting) -> int:
     return max(f.keyframe_b for f in earlier)
 
 
-def _wrong(mapper: MapOwner, waiting: list[Sighting]) -> set[tuple[int, int, str]]:
-    """Names of the sightings that do not fit the graph now, where they may move it freely."""
-    errors = mapper.smoother.relative_pose_errors(
-        MARKER, lambda T: mapper.loops.noise.map_covariances(np.zeros((len(T), 2)))
-    )
-    misfit = errors.chi2 > chi2_quantile(PROBABILITY, 6)
-    pairs = zip(errors.keyframe_a[misfit].tolist(), errors.keyframe_b[misfit].tolist(), strict=True)
-    return {(a, b, MARKER) for a, b in pairs} & {s.factor.name for s in waiting}
+def _is_covisible(mapper: MapOwner, a: int, b: int) -> bool:
+    """Whether two keyframes have landmarks in common: then there is no loop to close."""
+    first, second = (mapper.world.keyframes[k].landmark_ids for k in (a, b))
+    shared = np.intersect1d(first, second)
+    return int((shared >= 0).sum()) >= MIN_SHARED
+
+
+def _agreeing(mapper: MapOwner, waiting: list[Sighting]) -> list[Sighting]:
+    """The largest set of sightings that move the newest keyframe alike, or of several the least.
+
+    What two markers say may differ by their noise, and by what the map errs between them.
+    """
+    still = 2 * mapper.loops.noise.map_covariances(np.zeros(2))
+    gate, best = chi2_quantile(PROBABILITY, 6), (0, 0.0)
+    chosen: list[Sighting] = []
+    for one in waiting:
+        off = np.array([se3_log(se3_exp(-one.error) @ se3_exp(o.error)) for o in waiting])
+        S = np.array([one.factor.covariance + o.factor.covariance + still for o in waiting])
+        agree = mahalanobis(off, S) <= gate
+        score = int(agree.sum()), -float(np.linalg.norm(one.error))
+        if score > best:
+            best = score
+            chosen = [o for o, fits in zip(waiting, agree.tolist(), strict=True) if fits]
+    return chosen
+
+
+def _misfits(mapper: MapOwner) -> set[RelativePoseName]:
+    """Names of the sightings and loops that do not fit the graph."""
+    found: set[RelativePoseName] = set()
+    for kind in (MARKER, LOOP):
+        errors = mapper.smoother.relative_pose_errors(
+            kind, lambda T: mapper.loops.noise.map_covariances(np.zeros((len(T), 2)))
+        )
+        misfit = errors.chi2 > chi2_quantile(PROBABILITY, 6)
+        ends = errors.keyframe_a[misfit].tolist(), errors.keyframe_b[misfit].tolist()
+        found |= {(a, b, kind) for a, b in zip(*ends, strict=True)}
+    return found
 
 
 def _constraint(sighting: Sighting, end: int) -> LoopConstraint:

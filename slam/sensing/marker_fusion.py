@@ -16,6 +16,7 @@ from bmask_slam.events import EventLog
 from bmask_slam.features.marker_detection import FREE, possible_poses
 from bmask_slam.graph.arrays import Array, Arrays
 from bmask_slam.graph.factors.checks import chi2_quantile, mahalanobis
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import (
     MARKER,
     SITE,
@@ -28,7 +29,7 @@ from bmask_slam.graph.factors.graph_update import (
 )
 from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.geometry import inverse, se3_log
-from bmask_slam.graph.sensors.markers import MarkersConfig, SeenCorners
+from bmask_slam.graph.sensors.markers import FoundMarker, MarkerMap, MarkersConfig, SeenCorners
 from bmask_slam.graph.sensors.mounting import T_of
 from bmask_slam.graph.sensors.streams import SensorStreams
 from bmask_slam.sensing.marker_sightings import (
@@ -36,8 +37,9 @@ from bmask_slam.sensing.marker_sightings import (
     Sighting,
     Verdict,
     chosen,
-    covisible_path,
+    drift_path,
     has,
+    markers_in,
     of_keyframes,
     sightings_of,
     spread,
@@ -47,6 +49,8 @@ from bmask_slam.world.world_map import Keyframe
 
 PROBABILITY = 0.9999
 """Sightings that fit less well than all but this share do not fit."""
+NOISE_PROBABILITY = 0.99
+"""Corners that fit less well than all but this share have a larger sigma than was said."""
 NEWEST = 20
 """So many sightings say where a marker is."""
 MAX_SCALE = 3.0
@@ -125,9 +129,11 @@ class MarkerFusion:
         best = chosen(poses, expected)
         if best is None:
             return Verdict.AMBIGUOUS
-        scale = max(best.chi2 / max(best.degrees, 1), 1.0)
+        scale = best.chi2 / best.degrees
         if scale > MAX_SCALE**2:
             return Verdict.NO_SQUARE
+        if best.chi2 <= chi2_quantile(NOISE_PROBABILITY, best.degrees):
+            scale = 1.0
         robust = None if self.config.robust == "none" else self.config.robust
         T, covariance = best.T_marker_camera, scale * best.covariance
         factor = RelativePose(name[0], name[1], T, covariance, robust, MARKER)
@@ -144,7 +150,7 @@ class MarkerFusion:
         still = sight.drift.map_covariances(np.zeros(2))
         if mahalanobis(found.error[None], (S + still)[None])[0] <= gate:
             return found
-        path = covisible_path(sight.world, found.factor.keyframe_b, [f.keyframe_b for f in earlier])
+        path = drift_path(sight, found.factor.keyframe_b, [f.keyframe_b for f in earlier])
         drifted = sight.drift.map_covariances(path)
         if mahalanobis(found.error[None], (S + drifted)[None])[0] <= gate:
             self.waiting.append(found)
@@ -209,6 +215,25 @@ class MarkerFusion:
             return SensorChanges(relative_poses=tuple(factors))
         prior = PosePrior(site, T_world_site, diagonal_covariance(SIGMA_RAD, SIGMA_M))
         return SensorChanges(np.array([site]), T_world_site[None], (prior,), tuple(factors))
+
+    def map(
+        self, tables: FactorTables, segment: int, sightings: Mapping[int, Mapping[str, int]]
+    ) -> MarkerMap:
+        """The markers of a map segment, with what became of their sightings."""
+        found = []
+        for key in markers_in(tables):
+            where, number = marker_of(key) or (-1, -1)
+            if where == segment:
+                (T,) = tables.keyframes.get(np.array([key]))
+                size, sigma = self.size_of(number)
+                size_m = float(np.exp(size)) if np.isfinite(sigma) else np.nan
+                used = len(sightings_of(tables, key))
+                counts = sightings.get(key, {})
+                seen = used + sum(n for what, n in counts.items() if what != "used")
+                found.append(FoundMarker(number, size_m, T, seen, used))
+        site, known = np.array([site_id(segment)]), tables.keyframes
+        T_world_site = known.get(site)[0] if has(tables, site_id(segment)) else None
+        return MarkerMap(self.config.dictionary, T_world_site, tuple(found))
 
     def report(self, sightings: Mapping[int, Mapping[str, int]]) -> None:
         """Tell and count how many markers were seen, and what became of their sightings."""

@@ -144,29 +144,46 @@ def spread(earlier: Sequence[RelativePose], T_marker_camera: Array) -> Array:
     return np.asarray((S + S.T) / 2)
 
 
-def covisible_path(world: WorldMap, start: int, ends: Sequence[int]) -> Array:
-    """Radians and metres (2,) from a keyframe to the nearest of others, over common landmarks.
+def drift_path(sight: MarkerSight, start: int, ends: Sequence[int]) -> Array:
+    """Radians and metres (2,) over which the map can have drifted from a keyframe to the nearest.
 
     From keyframe to keyframe of the segment: those that share ``MIN_SHARED`` landmarks, and each
-    to the next.
+    to the next. Between keyframes that see the same marker there is no drift.
     """
-    keyframes = world.in_segment(world.keyframes[start].segment)
+    keyframes = sight.world.in_segment(sight.world.keyframes[start].segment)
     ids = np.array([k.id for k in keyframes])
     poses = np.array([k.T_world_camera for k in keyframes])
-    edges = _covisible(keyframes)
+    held = _by_marker(sight.tables, ids)
+    edges = np.concatenate([held, _covisible(keyframes)])
+    edges = edges[np.sort(np.unique(edges, axis=0, return_index=True)[1])]
     steps = inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]]
     turned_rad = np.linalg.norm(so3_log(steps[:, :3, :3]), axis=1)
     moved_m = np.linalg.norm(steps[:, :3, 3], axis=1)
-    graph = csr_array((1e-6 + turned_rad + moved_m, edges.T), (len(ids), len(ids)))
+    at_once = {(a, b) for a, b in held.tolist()}
+    lengths = 1e-6 + turned_rad + moved_m
+    lengths[[tuple(edge) in at_once for edge in edges.tolist()]] = 1e-6
+    graph = csr_array((lengths, edges.T), (len(ids), len(ids)))
     begin = int(np.searchsorted(ids, start))
     reached, before = dijkstra(graph, directed=False, indices=begin, return_predecessors=True)
     targets = np.searchsorted(ids, np.intersect1d(ids, list(ends)))
     at, path = int(targets[np.argmin(reached[targets])]), np.zeros(2)
     while at != begin:
-        step = inverse(poses[before[at]]) @ poses[at]
-        path += np.linalg.norm(so3_log(step[:3, :3])), np.linalg.norm(step[:3, 3])
-        at = int(before[at])
+        last = int(before[at])
+        if (min(last, at), max(last, at)) not in at_once:
+            step = inverse(poses[last]) @ poses[at]
+            path += np.linalg.norm(so3_log(step[:3, :3])), np.linalg.norm(step[:3, 3])
+        at = last
     return path
+
+
+def _by_marker(tables: FactorTables, ids: Ints) -> Ints:
+    """Pairs (N, 2) of places in ids (K,), ascending: keyframes that see one marker in a row."""
+    pairs = [np.zeros((0, 2), np.int64)]
+    for key in markers_in(tables):
+        seen = np.array([f.keyframe_b for f in sightings_of(tables, key)], np.int64)
+        places = np.searchsorted(ids, np.intersect1d(seen, ids))
+        pairs.append(np.stack([places[:-1], places[1:]], axis=1))
+    return np.concatenate(pairs)
 
 
 def _covisible(keyframes: Sequence[Keyframe]) -> Ints:

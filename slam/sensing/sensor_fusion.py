@@ -35,6 +35,7 @@ from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.inertial.tables import InertialState
 from bmask_slam.graph.sensors.accelerometer import Plumb
 from bmask_slam.graph.sensors.config import SensorsConfig
+from bmask_slam.graph.sensors.markers import MarkerMap
 from bmask_slam.graph.sensors.odometry import Motion, motion_between
 from bmask_slam.graph.sensors.streams import Measurements, SensorStreams
 from bmask_slam.graph.smoother.smoother import Smoother
@@ -207,6 +208,10 @@ class SensorFusion:
     def keep_verdict(self, name: RelativePoseName, verdict: Verdict | None) -> None:
         """Keep what became of a marker's sighting: a factor, or why not."""
         self._made[name] = np.nan if verdict is None else float(verdict)
+
+    def marker_map(self, tables: FactorTables, segment: int) -> MarkerMap:
+        """The markers of a map segment."""
+        return self.markers.map(tables, segment, self.sightings())
 
     def sightings(self) -> dict[int, dict[str, int]]:
         """By marker's id in the graph: how many sightings were "used", and refused for a reason."""
