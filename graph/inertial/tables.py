@@ -86,6 +86,7 @@ class InertialState:
         keyframe: its id. timestamp_s: its time.
         velocity: (3,) m/s. down: (3,) unit vector of gravity.
         bias: (6,) of the accelerometer, m/s^2, and the gyroscope, rad/s.
+        mounting: (8,) T_camera_imu in TUM's columns and the delay in s, where they were estimated.
     """
 
     keyframe: int
@@ -93,16 +94,19 @@ class InertialState:
     velocity: Array
     down: Array
     bias: Array
+    mounting: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def numbers(self) -> Array:
-        """All of it as (14,), for a file."""
-        return np.array([self.keyframe, self.timestamp_s, *self.velocity, *self.down, *self.bias])
+        """All of it as (14,) or (22,), for a file."""
+        motion = (*self.velocity, *self.down, *self.bias)
+        return np.array([self.keyframe, self.timestamp_s, *motion, *self.mounting])
 
     @classmethod
     def of(cls, numbers: Array) -> InertialState:
         """The state of ``numbers``."""
-        return cls(int(numbers[0]), float(numbers[1]), numbers[2:5], numbers[5:8], numbers[8:14])
+        known = numbers[2:5], numbers[5:8], numbers[8:14], numbers[14:]
+        return cls(int(numbers[0]), float(numbers[1]), *known)
 
 
 @dataclass(frozen=True)

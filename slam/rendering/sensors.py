@@ -86,7 +86,7 @@ def imu(T_world_camera: Array, hertz: float, config: ImuConfig, rng: np.random.G
     Rates are those from the pose before to the one after, forces the second differences of the
     IMU's position, so that their integrals lead back to the poses.
     """
-    T = T_world_camera @ T_of(config.imu_in_camera)
+    T = T_world_camera @ config.T_camera_imu
     R, p = T[:, :3, :3], T[:, :3, 3]
     padded = np.concatenate([R[:1], R, R[-1:]])
     rates = so3_log(padded[:-2].mT @ padded[2:]) * hertz / 2

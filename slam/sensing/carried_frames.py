@@ -72,8 +72,8 @@ def example_state() -> Arrays:
     made: Arrays = {"made": np.zeros((0, 3), np.int64), "made_s": np.zeros(0)}
     plumbs: Arrays = {"plumb_ids": np.zeros(0, np.int64), "plumbs": np.zeros((0, 13))}
     first: Arrays = {"first_keyframe": np.array(0), "newest": np.zeros(0)}
-    markers: Arrays = {"marker_sizes": np.zeros((0, 3))}
-    return {**nested(streams=rows), **first, **made, **plumbs, **markers}
+    found: Arrays = {"marker_sizes": np.zeros((0, 3)), "imu_mounting": np.zeros(0)}
+    return {**nested(streams=rows), **first, **made, **plumbs, **found}
 
 
 def is_known(name: RelativePoseName, world: WorldMap) -> bool:

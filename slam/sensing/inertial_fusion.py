@@ -100,8 +100,11 @@ def _restarts(
     return found
 
 
-def newest_state(world: WorldMap, tables: FactorTables) -> InertialState | None:
-    """What the graph knows of the motion at the newest keyframe that an IMU led to."""
+def newest_state(world: WorldMap, tables: FactorTables, mounting: Array) -> InertialState | None:
+    """What the graph knows of the motion at the newest keyframe that an IMU led to.
+
+    ``mounting`` (8,) and the delay, where they were estimated; else empty.
+    """
     inertial = tables.inertial
     known = [k for k in inertial.states if k in world.keyframes]
     if not known:
@@ -111,7 +114,8 @@ def newest_state(world: WorldMap, tables: FactorTables) -> InertialState | None:
     if down is None:
         return None
     R = keyframe.T_world_camera[:3, :3].T
-    return InertialState(keyframe.id, keyframe.timestamp_s, R @ state[:3], R @ down, state[3:])
+    motion = R @ state[:3], R @ down, state[3:]
+    return InertialState(keyframe.id, keyframe.timestamp_s, *motion, mounting)
 
 
 def motion_by_imu(

@@ -41,6 +41,7 @@ from bmask_slam.graph.sensors.streams import Measurements, SensorStreams
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.loops.closing import LoopCloser
 from bmask_slam.sensing.carried_frames import carried_frames, example_state, is_known
+from bmask_slam.sensing.imu_estimation import MountingEstimator, with_mounting
 from bmask_slam.sensing.inertial_fusion import carried, inertial_update, motion_by_imu, newest_state
 from bmask_slam.sensing.marker_fusion import MarkerFusion
 from bmask_slam.sensing.marker_sightings import WORDS, MarkerSight, Verdict
@@ -77,6 +78,7 @@ class SensorFusion:
         refused: by sensor, how many measurements came too late.
         newest: how the camera moved at the newest keyframe, with an IMU.
         markers: makes the factors of markers.
+        imu: finds how the IMU is mounted.
     """
 
     def __init__(self, config: SensorsConfig, events: EventLog) -> None:
@@ -88,6 +90,7 @@ class SensorFusion:
         self._plumbs: dict[int, Plumb] = {}
         self.newest: InertialState | None = None
         self.markers = MarkerFusion(config.markers, events)
+        self.imu = MountingEstimator(config.imu, events)
         self._first_keyframe = 0  # of this session
 
     def add(self, new: Measurements, world: WorldMap) -> None:
@@ -119,7 +122,9 @@ class SensorFusion:
         if end_s - begin_s <= config.max_blackout_s:
             moved = motion_between(self.streams, begin_s, end_s, config, config.max_gap_s)
         if moved is None and self.newest is not None:
-            moved = motion_by_imu(self.streams, self.newest, begin_s, end_s, self.config.imu)
+            imu, mounting = self.config.imu, self.newest.mounting
+            imu = with_mounting(imu, mounting) if len(mounting) else imu
+            moved = motion_by_imu(self.streams, self.newest, begin_s, end_s, imu)
         return moved
 
     def carry_over(self, old: FactorTables, new: FactorTables, world: WorldMap) -> SensorChanges:
@@ -147,6 +152,7 @@ class SensorFusion:
         Its measurements replace the present ones and are of its keyframes only; factors stay.
         """
         self.streams, self.refused, self.newest = SensorStreams(), {}, None
+        self.imu.begin_session()
         self._first_keyframe = first_keyframe
         self._made = dict.fromkeys(self._made, np.nan)  # stamps are of the other recording
 
@@ -170,7 +176,10 @@ class SensorFusion:
 
     def _inertial(self, keyframes: list[Keyframe], tables: FactorTables) -> SensorChanges:
         """Factors of an IMU; a new keyframe that shares too little is held weakly beside them."""
-        update = inertial_update(keyframes, tables.inertial, self.streams, self.config.imu)
+        self.imu.update(keyframes, self.streams)
+        if (config := self.imu.config) is None:
+            return SensorChanges()
+        update = inertial_update(keyframes, tables.inertial, self.streams, config)
         weak = []
         by_id = {k.id: k for k in keyframes}
         for factor in update.factors:
@@ -184,7 +193,7 @@ class SensorFusion:
     def follow(self, owner: GraphOwner) -> None:
         """The graph was optimised: keep how the camera moves, for a blackout."""
         if self.streams or owner.smoother.tables.inertial:
-            self.newest = newest_state(owner.world, owner.smoother.tables)
+            self.newest = newest_state(owner.world, owner.smoother.tables, self.imu.found)
 
     def _odometry(self, keyframes: list[Keyframe]) -> Iterator[RelativePose]:
         """Motion between keyframes in a row."""
@@ -226,6 +235,7 @@ class SensorFusion:
     def report(self, smoother: Smoother) -> None:
         """Tell how many factors of each kind do not fit the final estimate."""
         self.markers.report(self.sightings())
+        self.imu.report(self.streams)
         for kind in KINDS if self._made else ():
             found = smoother.relative_pose_errors(kind)
             wrong = found.chi2 > chi2_quantile(FIT_PROBABILITY, DEGREES[kind])
@@ -245,6 +255,7 @@ class SensorFusion:
         return {
             **nested(streams=self.streams.state()),
             **self.markers.state(),
+            **self.imu.state(),
             "first_keyframe": np.array(self._first_keyframe),
             "made": np.array(ids, np.int64).reshape(-1, 3),
             "made_s": np.array(list(self._made.values()), float),
@@ -261,6 +272,7 @@ class SensorFusion:
         state = {**{n: a for n, a in example_state().items() if "." not in n}, **state}
         self.streams.restore(part(state, "streams"))
         self.markers.restore(state)
+        self.imu.restore(state)
         self._first_keyframe = int(state["first_keyframe"])
         self.newest = InertialState.of(state["newest"]) if len(state["newest"]) else None
         made = zip(state["made"].tolist(), state["made_s"].tolist(), strict=True)
