@@ -239,8 +239,8 @@ class SlamSystem(SensorSystem):
         reason = "" if restored else self.keyframes.reason(tracked)
         if not reason:
             return tracked, None, ""
-        if self.markers is not None:
-            self.map.add_measurements(self.markers.detect(frame, self.camera))
+        if self.markers is not None and len((seen := self.markers.detect(frame, self.camera)).rows):
+            self.map.add_measurements(seen)
         return *self.insert(frame, tracked, self.camera_tracker.local_ids), reason
 
     @stage("graph")

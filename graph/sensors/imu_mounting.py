@@ -64,7 +64,6 @@ def find_mounting(T_world_camera: Array, cut: Cut, config: ImuConfig) -> ImuMoun
     seconds = np.array([r[:, 0].sum() for r in readings])
     prior = np.array([0.0] * 3 + [config.sigma_gyroscope_bias] * 3 + [_DELAY_SIGMA_S])
     weights = np.where(prior > 0, 1 / np.maximum(prior, 1e-12) ** 2, 1e-6)
-    sigma = _TURN_SIGMA_RAD
     for _ in range(_ITERATIONS):
         moved = [cut(delay_s + step) for step in (-_DELAY_STEP_S, 0.0, _DELAY_STEP_S)]
         if any(m is None for m in moved):
@@ -74,28 +73,28 @@ def find_mounting(T_world_camera: Array, cut: Cut, config: ImuConfig) -> ImuMoun
         drift = (late - early)[..., None] / (2 * _DELAY_STEP_S)
         J = np.concatenate([X @ skew(now), seconds[:, None, None] * X, -X @ drift], axis=2)
         off = np.concatenate([np.zeros(3), bias, [delay_s - config.delay_s]])
-        fitted = np.sqrt(r.size / (r.size - len(weights)))
-        sigma = max(_TURN_SIGMA_RAD, 1.48 * fitted * float(np.median(np.abs(r))))
-        robust = 1 / np.maximum(1.0, np.linalg.norm(r, axis=1) / (3 * sigma))[:, :, None]
-        H = np.sum(robust * (J.mT @ J), axis=0) / sigma**2 + np.diag(weights)
-        g = np.sum(robust * (J.mT @ r), axis=0)[:, 0] / sigma**2 + weights * off
-        step = -np.linalg.solve(H, g)
+        H, g = _normal_equations(r, J)
+        H += np.diag(weights)
+        step = -np.linalg.solve(H, g + weights * off)
         X, bias = X @ so3_exp(step[:3]), bias + step[3:6]
         delay_s += float(np.clip(step[6], -_DELAY_STEP_S * 5, _DELAY_STEP_S * 5))
-    covariance = np.linalg.inv(H)
-    sigmas = np.sqrt(np.diag(covariance))
+    sigmas = np.sqrt(np.diag(np.linalg.inv(H)))
     final = cut(delay_s)
     if final is None:
         return None
     lever, lever_sigma_m = find_lever(T_world_camera, final, X, (bias, config))
-    return ImuMounting(
-        make_pose(X, lever),
-        sigmas[:3],
-        lever_sigma_m,
-        delay_s,
-        float(sigmas[6]),
-        float(np.sqrt(np.mean(r**2))),
-    )
+    late_sigma_s, residual_rad = float(sigmas[6]), float(np.sqrt(np.mean(r**2)))
+    place = make_pose(X, lever), sigmas[:3], lever_sigma_m
+    return ImuMounting(*place, delay_s, late_sigma_s, residual_rad)
+
+
+def _normal_equations(r: Array, J: Array) -> tuple[Array, Array]:
+    """H (7, 7) and g (7,) of residuals (K, 3, 1), weighted by their own spread, with Huber's."""
+    fitted = np.sqrt(r.size / (r.size - J.shape[2]))
+    sigma = max(_TURN_SIGMA_RAD, 1.48 * fitted * float(np.median(np.abs(r))))
+    robust = 1 / np.maximum(1.0, np.linalg.norm(r, axis=1) / (3 * sigma))[:, :, None]
+    H = np.sum(robust * (J.mT @ J), axis=0) / sigma**2
+    return H, np.sum(robust * (J.mT @ r), axis=0)[:, 0] / sigma**2
 
 
 def _rotation(a: Array, b: Array) -> Array:
@@ -132,11 +131,13 @@ def find_lever(
         A[k, 1, :, at : at + 3], A[k, 1, :, at + 3 : at + 6] = eye, -eye
         y[k] = p[k + 1] - p[k] - R[k] @ dp, -R[k] @ dv
     scale = np.array([1.0, _SPEED_WEIGHT_S])[:, None] / _PLACE_SIGMA_M
-    A, y = (A * scale[..., None]).reshape(6 * K, -1), (y * scale).ravel()
-    H, g = A.T @ A, A.T @ y
+    J, r = (A * scale[..., None]).reshape(6 * K, -1), (y * scale).ravel()
+    H, g = J.T @ J, J.T @ r
     H[3:6, 3:6] += eye / _LEVER_SIGMA_M**2
     H[6:9, 6:9] += eye / config.sigma_accelerometer_bias**2
     H += 1e-9 * np.eye(len(H))
     x, covariance = np.linalg.solve(H, g), np.linalg.inv(H)
-    spread = max(1.0, float(np.mean((A @ x - y) ** 2)))
-    return x[3:6], float(np.sqrt(spread * np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))
+    spread = max(1.0, float(np.mean((J @ x - r) ** 2)))
+    return x[3:6].astype(float), float(
+        np.sqrt(spread * np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])
+    )

@@ -21,7 +21,7 @@ from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.loops.closing import LoopCloser
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.sensing.marker_fusion import PROBABILITY
-from bmask_slam.sensing.marker_sightings import MIN_SHARED, Sighting, Verdict, sightings_of
+from bmask_slam.sensing.marker_sightings import MIN_SHARED, Sighting, sightings_of
 from bmask_slam.sensing.sensor_fusion import SensorFusion
 from bmask_slam.world.world_map import WorldMap
 
@@ -58,10 +58,7 @@ def close_marker_loops(mapper: MapOwner) -> None:
     wrong = names if spoilt else names & misfits
     wrong |= {s.factor.name for s in waiting} - {s.factor.name for s in agreeing}
     for sighting in waiting:
-        moved = sighting.factor.name in wrong
-        mapper.sensors.keep_verdict(sighting.factor.name, Verdict.MOVED if moved else None)
-        if moved:
-            markers.tell_moved(sighting)
+        mapper.sensors.keep_verdict(sighting, moved=sighting.factor.name in wrong)
     kept = [(s, end) for s, end in zip(waiting, ends, strict=True) if s.factor.name not in wrong]
     mapper.change_graph(
         remove_relative_poses=tuple(sorted(names)), relative_poses=tuple(s.factor for s, _ in kept)

@@ -27,6 +27,8 @@ EVERY = 5
 """After so many further keyframes it is tried again."""
 NEWEST, APART_S = 100, 0.25
 """By so many of the newest keyframes, those that are so far apart."""
+MARGIN_S = 0.05
+"""Readings begin so long before, for delays that are tried."""
 
 
 class MountingEstimator:
@@ -73,7 +75,7 @@ class MountingEstimator:
         keyframes = _apart(keyframes)
         stamps_s = [k.timestamp_s for k in keyframes]
         for k, (a, b) in enumerate(pairwise(stamps_s)):
-            if readings_between(streams, a, b, config) is None:
+            if readings_between(streams, a - MARGIN_S, b, config) is None:
                 begin = k + 1
         poses, times = np.array([k.T_world_camera for k in keyframes[begin:]]), stamps_s[begin:]
 

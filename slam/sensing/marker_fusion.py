@@ -44,7 +44,7 @@ from bmask_slam.sensing.marker_sightings import (
     sightings_of,
     spread,
 )
-from bmask_slam.sensing.reference_frame import SIGMA_M, SIGMA_RAD, SensorChanges
+from bmask_slam.sensing.reference_frame import SIGMA_M, SIGMA_RAD, Made, SensorChanges
 from bmask_slam.world.world_map import Keyframe
 
 PROBABILITY = 0.9999
@@ -155,11 +155,14 @@ class MarkerFusion:
         if mahalanobis(found.error[None], (S + drifted)[None])[0] <= gate:
             self.waiting.append(found)
             return None
-        self.tell_moved(found)
+        self.tell_moved(found, sight.made)
         return Verdict.MOVED
 
-    def tell_moved(self, found: Sighting) -> None:
-        """Say that a marker is not where it was."""
+    def tell_moved(self, found: Sighting, made: Made) -> None:
+        """Say that a marker is not where it was, the first time."""
+        key = found.factor.keyframe_a
+        if any(name[0] == key and value == Verdict.MOVED for name, value in made.items()):
+            return
         off_m = float(np.linalg.norm(found.error[3:]))
         off_deg = float(np.degrees(np.linalg.norm(found.error[:3])))
         self._events.sensor(

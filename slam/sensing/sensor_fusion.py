@@ -27,7 +27,6 @@ from bmask_slam.graph.factors.graph_update import (
     POSITION,
     SITE,
     RelativePose,
-    RelativePoseName,
 )
 from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.files.array_file import nested, part
@@ -44,7 +43,7 @@ from bmask_slam.sensing.carried_frames import carried_frames, example_state, is_
 from bmask_slam.sensing.imu_estimation import MountingEstimator, with_mounting
 from bmask_slam.sensing.inertial_fusion import carried, inertial_update, motion_by_imu, newest_state
 from bmask_slam.sensing.marker_fusion import MarkerFusion
-from bmask_slam.sensing.marker_sightings import WORDS, MarkerSight, Verdict
+from bmask_slam.sensing.marker_sightings import WORDS, MarkerSight, Sighting, Verdict
 from bmask_slam.sensing.planar_motion import planar_changes
 from bmask_slam.sensing.reference_frame import Made, ReferenceFrame, SensorChanges
 from bmask_slam.world.frame_history import FrameHistory
@@ -214,9 +213,11 @@ class SensorFusion:
         for keyframe_id in [i for i in self._plumbs if i not in world.keyframes]:
             del self._plumbs[keyframe_id]
 
-    def keep_verdict(self, name: RelativePoseName, verdict: Verdict | None) -> None:
-        """Keep what became of a marker's sighting: a factor, or why not."""
-        self._made[name] = np.nan if verdict is None else float(verdict)
+    def keep_verdict(self, found: Sighting, moved: bool) -> None:
+        """Keep what became of a marker's sighting that waited: a factor, or refused."""
+        if moved:
+            self.markers.tell_moved(found, self._made)
+        self._made[found.factor.name] = float(Verdict.MOVED) if moved else np.nan
 
     def marker_map(self, tables: FactorTables, segment: int) -> MarkerMap:
         """The markers of a map segment."""
