@@ -17,6 +17,8 @@ from bmask_slam.graph.arrays import Array, Arrays, Ints
 Name = tuple[str, int, int]
 """("imu", keyframe_a, keyframe_b), ("bias", keyframe, 0) or ("gravity", segment, 0)."""
 IMU, BIAS, GRAVITY = "imu", "bias", "gravity"
+_REPLACED = "replaced"
+"""In ISAM2 still, of two keyframes that have another factor now."""
 STATE = 9
 """A keyframe's velocity in the world, m/s, and the biases of its accelerometer, m/s^2, and its
 gyroscope, rad/s, in the IMU's frame."""
@@ -168,9 +170,12 @@ class InertialTables:
         return bool(self.factors)
 
     def add(self, update: InertialUpdate) -> None:
-        """Remove and add factors, with the states that are given."""
+        """Remove and add factors, with the states that are given; one may replace another."""
         for pair in update.remove:
             self.factors.pop(pair, None)
+        for factor in update.factors:
+            if (slot := self.slots.pop(factor.name, None)) is not None:
+                self.slots[_REPLACED, factor.keyframe_a, factor.keyframe_b] = slot
         self.factors |= {(f.keyframe_a, f.keyframe_b): f for f in update.factors}
         self.states |= update.states
         self.down |= update.down
@@ -201,7 +206,7 @@ class InertialTables:
     def change(self) -> InertialChange:
         """What differs from what is in ISAM2; the slots of what goes are forgotten."""
         names, slots = self.names, self.slots
-        keyframes = {k for what, *pair in slots if what == IMU for k in pair}
+        keyframes = {k for what, *pair in slots if what in (IMU, _REPLACED) for k in pair}
         segments = {segment for what, segment, _ in slots if what == GRAVITY}
         gone = sorted(set(slots) - set(names))
         return InertialChange(

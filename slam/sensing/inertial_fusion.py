@@ -42,12 +42,16 @@ class _Link:
 def inertial_update(
     keyframes: Sequence[Keyframe], tables: InertialTables, streams: SensorStreams, config: ImuConfig
 ) -> InertialUpdate:
-    """The factors that can be made now between the keyframes of one segment, in their order."""
+    """The factors that can be made now between the keyframes of one segment, in their order.
+
+    Those of another mounting are made anew.
+    """
     if not config.enabled or not len(streams.of("imu")):
         return InertialUpdate()
     links = []
     for a, b in pairwise(keyframes):
-        known = (a.id, b.id) in tables.factors
+        factor, model = tables.factors.get((a.id, b.id)), config.model
+        known = factor is not None and np.array_equal(factor.model.numbers, model.numbers)
         if not known and b.timestamp_s - a.timestamp_s <= config.max_apart_s:
             readings = readings_between(streams, a.timestamp_s, b.timestamp_s, config)
             if readings is not None:

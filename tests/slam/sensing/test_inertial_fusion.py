@@ -172,3 +172,10 @@ def test_a_mounting_that_is_not_given_is_estimated_and_used() -> None:
     states = [system.state() for system in (first, second)]
     for name in states[0]:
         np.testing.assert_array_equal(states[0][name], states[1][name], name)
+    found.found = found.found + np.eye(8)[0] * 0.01  # better known: all is made anew
+    first.mapper.add_waiting_measurements()
+    inertial = first.mapper.smoother.tables.inertial
+    assert {f.model.T_camera_imu[0, 3] for f in inertial.factors.values()} == {found.found[0]}
+    names = [name for name in inertial.slots if name[0] == "imu"]
+    assert sorted(name[1:] for name in names) == sorted(inertial.factors)
+    assert not [name for name in inertial.slots if name[0] == "replaced"]
