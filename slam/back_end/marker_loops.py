@@ -12,18 +12,32 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from bmask_slam.back_end.segment_joining import move_segment
 from bmask_slam.events import EventLog
-from bmask_slam.graph.arrays import no_pairs
+from bmask_slam.graph.arrays import Array, no_pairs
 from bmask_slam.graph.factors.checks import chi2_quantile, mahalanobis
-from bmask_slam.graph.factors.graph_update import LOOP, MARKER, RelativePoseName
-from bmask_slam.graph.geometry import se3_exp, se3_log
+from bmask_slam.graph.factors.graph_update import (
+    LOOP,
+    MARKER,
+    RelativePoseName,
+    marker_of,
+)
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.loops.closing import LoopCloser
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.sensing.marker_fusion import PROBABILITY
-from bmask_slam.sensing.marker_sightings import MIN_SHARED, Sighting, sightings_of
+from bmask_slam.sensing.marker_sightings import (
+    MIN_SHARED,
+    Sighting,
+    markers_in,
+    sightings_of,
+)
 from bmask_slam.sensing.sensor_fusion import SensorFusion
 from bmask_slam.world.world_map import WorldMap
+
+MIN_SIGHTINGS = 2
+"""So many keyframes of each of two segments see a marker that joins them."""
 
 
 class MapOwner(Protocol):
@@ -40,6 +54,9 @@ class MapOwner(Protocol):
 
     def fuse(self, loops: list[LoopConstraint]) -> None:
         """Fuse the landmarks of both sides of loops."""
+
+    def rebuild(self) -> None:
+        """Build the graph anew, after segments were moved."""
 
 
 def close_marker_loops(mapper: MapOwner) -> None:
@@ -121,3 +138,29 @@ def _constraint(sighting: Sighting, end: int) -> LoopConstraint:
     """A loop between two keyframes, whose landmarks are fused by projection."""
     newer = sighting.factor.keyframe_b
     return LoopConstraint(end, newer, np.eye(4), np.eye(6), 0, 1.0, no_pairs())
+
+
+def join_by_markers(mapper: MapOwner, segment: int) -> Array | None:
+    """Move a map segment into another one that has a marker in common with it.
+
+    Each must have seen it in ``MIN_SIGHTINGS`` keyframes. Of several markers, or segments, that
+    with most sightings counts. Returns T_other_segment (4, 4); None where there is no such marker.
+    """
+    tables, best, chosen = mapper.smoother.tables, 0, None
+    seen = {key: sightings_of(tables, key) for key in markers_in(tables)}
+    for key, own in seen.items():
+        for other, theirs in seen.items():
+            (a, number), (b, same) = marker_of(key) or (0, 0), marker_of(other) or (0, 1)
+            count = min(len(own), len(theirs))
+            if a == segment != b and number == same and count >= MIN_SIGHTINGS and count > best:
+                best, chosen = count, (key, other, own[-1].keyframe_b, theirs[-1].keyframe_b)
+    if chosen is None:
+        return None
+    T_segment_marker, T_other_marker = (tables.keyframes.get(np.array([k]))[0] for k in chosen[:2])
+    T_other_segment: Array = T_other_marker @ inverse(T_segment_marker)
+    (target, number), (older, newer) = marker_of(chosen[1]) or (0, 0), sorted(chosen[2:])
+    mapper.events.joined_by_marker(segment, target, number)
+    move_segment(mapper.world, segment, T_other_segment, target)
+    mapper.rebuild()
+    mapper.fuse([LoopConstraint(older, newer, np.eye(4), np.eye(6), 0, 1.0, no_pairs())])
+    return T_other_segment

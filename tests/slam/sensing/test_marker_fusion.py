@@ -12,6 +12,7 @@ from synthetic_view import CAMERA, add_keyframe, make_features, points_before, r
 from bmask_slam.back_end.config import BackEndConfig
 from bmask_slam.back_end.landmark_management import MappingConfig
 from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.back_end.marker_loops import join_by_markers
 from bmask_slam.events import EventKind
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_update import MARKER, SITE, marker_id, marker_of, site_id
@@ -66,13 +67,16 @@ class Walk:
         self.looks = random_descriptors(60, self.rng)
         self.ids: Array | None = None
         self.truth: dict[int, Array] = {}
+        self.segment = 0
 
     def step(self, T: Array, places: dict[int, Array], T_tracked: Array | None = None) -> None:
         """A keyframe at T that sees these markers; tracking has another pose if it drifted."""
         mapper, stamp_s = self.mapper, STEP_S * len(self.truth)
         noise = self.rng.normal(0, [0.3, 0.3, 0.05], (60, 3))
         features = make_features(T, self.points, self.looks, noise)
-        keyframe = add_keyframe(mapper.world, T if T_tracked is None else T_tracked, features, 0)
+        keyframe = add_keyframe(
+            mapper.world, T if T_tracked is None else T_tracked, features, self.segment
+        )
         keyframe.timestamp_s = stamp_s
         if self.ids is None:
             tracked = keyframe.T_world_camera @ inverse(T)
@@ -203,6 +207,29 @@ def test_of_two_markers_the_one_that_was_moved_closes_no_loop() -> None:
     said = walk.said()
     assert [text for text in said if "marker 4 in keyframe 9 is" in text]
     assert walk.mapper.events.counts["markers: loops"] == 1
+
+
+def test_a_marker_that_two_segments_see_joins_them() -> None:
+    """The second began after the camera was lost, in a world frame of its own."""
+    walk, T_own_world = Walk(), se3_exp(np.array([0.5, -0.8, 0.3, 3.0, -1.0, 2.0]))
+    for k in range(3):
+        walk.step(pose(k), PLACES)
+    walk.segment, walk.ids = 1, None
+    walk.points, walk.looks = points_before(pose(4), 60, walk.rng), random_descriptors(60, walk.rng)
+    walk.step(pose(4), {9: PLACES[9]}, T_own_world @ pose(4))
+    assert join_by_markers(walk.mapper, 1) is None  # seen once
+    walk.step(pose(5), {9: PLACES[9]}, T_own_world @ pose(5))
+    walk.said()
+    T = join_by_markers(walk.mapper, 1)
+    assert T is not None
+    assert np.linalg.norm(se3_log(T @ T_own_world)[3:]) < 0.1  # metres away
+    assert walk.said()[0] == "segment 1 into segment 0, by marker 9"
+    assert {k.segment for k in walk.mapper.world.keyframes.values()} == {0}
+    assert np.abs(walk.off()[:, 3:]).max() < 0.03
+    tables = walk.mapper.smoother.tables
+    found = walk.mapper.sensors.marker_map(tables, 0).markers
+    assert [(m.id, m.used) for m in found] == [(4, 3), (9, 5)]
+    assert not walk.mapper.sensors.marker_map(tables, 1).markers
 
 
 def test_known_poses_give_the_frame_of_a_site() -> None:
