@@ -68,17 +68,17 @@ def test_an_exact_mounting_and_delay_are_found() -> None:
 
 
 def test_the_sigmas_are_those_of_drawn_noise() -> None:
-    """NEES of 8 mountings within its 99 % band, with the biases of an MPU-9250."""
+    """NEES of 6 mountings within its 99 % band, with the biases of an MPU-9250."""
     X, nees, late = T_of(MOUNTED.imu_in_camera or ()), [], []
-    for seed in range(8):
+    for seed in range(6):
         mounting = found(SWINGS, MOUNTED, np.random.default_rng(seed))
         off = se3_log(inverse(X) @ mounting.T_camera_imu)
         nees.append(float(np.mean((off[:3] / mounting.sigmas_rad) ** 2)))
         late.append((mounting.delay_s - DELAY_S) / mounting.delay_sigma_s)
         assert mounting.sigmas_rad.max() < 0.003
         assert np.abs(off[3:]).max() < 4 * mounting.lever_sigma_m
-    assert 0.4 < np.mean(nees) < 1.9
-    assert 0.4 < np.std(late) < 1.7
+    assert 0.35 < np.mean(nees) < 2.05
+    assert 0.3 < np.std(late) < 1.8
 
 
 def test_turns_about_one_axis_leave_the_rotation_open() -> None:
