@@ -146,7 +146,7 @@ class _SavedMarker(BaseModel):
 
     model_config = STRICT
     id: int
-    size_m: float
+    size_m: float | None
     T_world_marker: tuple[Row4, Row4, Row4, Row4]
     seen: int
     used: int
@@ -170,7 +170,13 @@ def read_markers(path: Path) -> MarkerMap:
     """Read what `write_markers` wrote. Raises InputError."""
     saved = read_json(path, _SavedMarkers, "run again with --markers")
     markers = [
-        FoundMarker(m.id, m.size_m, np.array(m.T_world_marker), m.seen, m.used)
+        FoundMarker(
+            m.id,
+            np.nan if m.size_m is None else m.size_m,
+            np.array(m.T_world_marker),
+            m.seen,
+            m.used,
+        )
         for m in saved.markers
     ]
     T_world_site = None if saved.T_world_site is None else np.array(saved.T_world_site)
