@@ -6,7 +6,9 @@ import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, get_args
+
+from bmask_slam.graph.errors import InputError
 
 if TYPE_CHECKING:
     from bmask_slam.evaluation import Row
@@ -126,6 +128,8 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", metavar="F", help=text)
     text = "one value of the configuration, such as tracking.min_inliers=20; may be repeated"
     parser.add_argument("--set", metavar="A.B=C", action="append", default=[], help=text)
+    text = "use fiducial markers, such as APRILTAG_36h11:0.16 or 4X4_50 (size by depth)"
+    parser.add_argument("--markers", metavar="DICT[:SIZE_M]", help=text)
 
 
 def chosen_config(arguments: argparse.Namespace) -> ChosenConfig:
@@ -134,11 +138,27 @@ def chosen_config(arguments: argparse.Namespace) -> ChosenConfig:
     from bmask_slam.system_config import SystemConfig
 
     file = find_config(arguments.config) if arguments.config else None
-    plain = resolve(SystemConfig, file, arguments.set)
+    settings = [*arguments.set, *_marker_settings(getattr(arguments, "markers", None))]
+    plain = resolve(SystemConfig, file, settings)
     segmenter = segmenter_options(arguments, plain.semantics.segmenter)
     config = replace(plain, semantics=replace(plain.semantics, segmenter=segmenter))
-    is_default = not (file or arguments.set) and config == plain
+    is_default = not (file or settings) and config == plain
     return ChosenConfig(config, file.stem if file else "", is_default)
+
+
+def _marker_settings(markers: str | None) -> list[str]:
+    """The settings that --markers stands for; the dictionary's name in any case, with DICT_ too."""
+    from bmask_slam.graph.sensors.markers import Dictionary
+
+    if markers is None:
+        return []
+    given, _, size_m = markers.partition(":")
+    names = {name.upper(): name for name in get_args(Dictionary)}
+    name = names.get(given.upper().removeprefix("DICT_"))
+    if name is None:
+        raise InputError(f"--markers {given}: no dictionary; choose of {', '.join(names.values())}")
+    settings = ["sensors.markers.enabled=true", f"sensors.markers.dictionary='{name}'"]
+    return [*settings, f"sensors.markers.size_m={size_m}"] if size_m else settings
 
 
 def add_view_arguments(parser: argparse.ArgumentParser) -> None:
