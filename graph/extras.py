@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 from types import ModuleType
 
@@ -28,3 +29,17 @@ def import_extra(name: str, needed_by: str, extra: str, instead: str = "") -> Mo
         if not missing:
             cure = f"remove it, and {cure}"
         raise InputError(f"{text}; {cure}{f', or {instead}' if instead else ''}") from error
+
+
+def load_libusb() -> None:
+    """Load libusb-1.0 of the wheel ``libusb_package``, if that is installed.
+
+    Libraries link to ``libusb-1.0.so.0``, which small machines do not have. A library of that name
+    that is already loaded with global symbols satisfies the linker.
+    """
+    try:
+        path = importlib.import_module("libusb_package").get_library_path()
+    except ImportError:
+        return
+    if path is not None:
+        ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)

@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -23,14 +23,14 @@ from bmask_slam import __version__
 from bmask_slam.commands.calibrate import add_calibrate
 from bmask_slam.commands.compare import add_compare
 from bmask_slam.commands.evaluate import add_evaluate
-from bmask_slam.commands.live import add_live
+from bmask_slam.commands.live import add_live, add_workstation
 from bmask_slam.commands.map import add_map, add_merge
 from bmask_slam.commands.optimise import add_optimise
 from bmask_slam.commands.results import add_export, add_query
 from bmask_slam.commands.run import add_run
 from bmask_slam.commands.segmentation import add_evaluate_segmentation, add_segment, add_train
 from bmask_slam.commands.sequences import add_convert, add_download, add_info, add_render
-from bmask_slam.commands.show import add_film, add_report, add_view
+from bmask_slam.commands.show import add_doctor, add_film, add_report, add_view
 from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.extras import import_extra
 from bmask_slam.runtime.memory import is_out_of_memory, memory_limit_bytes
@@ -39,6 +39,7 @@ from bmask_slam.runtime.stop_request import SIGNALS
 ADDED = (
     add_run,
     add_live,
+    add_workstation,
     add_evaluate,
     add_render,
     add_convert,
@@ -57,6 +58,7 @@ ADDED = (
     add_train,
     add_evaluate_segmentation,
     add_compare,
+    add_doctor,
 )
 """What adds a command, in the order of --help."""
 DESCRIPTION = "RGB-D SLAM on a GTSAM factor graph: a trajectory and a landmark map from a sequence."
@@ -103,7 +105,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = make_parser().parse_args(argv)
         _check_memory()
-        with _terminations(), _console_log(arguments.verbose):
+        with _terminations(), _console_log(arguments):
             code = int(arguments.handler(arguments))
         if code == 128 + signal.SIGHUP:  # the terminal was closed: nobody reads on
             _discard_output()
@@ -131,11 +133,16 @@ def _discard_output() -> None:
         os.dup2(nowhere, stream.fileno())
 
 
-def _console_log(verbose: bool) -> AbstractContextManager[None]:
-    """Warnings on stderr, with -v all that a run's log.txt gets."""
+def _console_log(arguments: argparse.Namespace) -> AbstractContextManager[None]:
+    """Warnings on stderr, with -v all that a run's log.txt gets.
+
+    Not for the doctor, which looks for the libraries that this needs.
+    """
+    if arguments.command == "doctor":
+        return nullcontext()
     from bmask_slam.runtime.progress import console_log
 
-    return console_log(logging.INFO if verbose else logging.WARNING)
+    return console_log(logging.INFO if arguments.verbose else logging.WARNING)
 
 
 def _check_memory() -> None:

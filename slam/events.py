@@ -164,6 +164,17 @@ class EventLog:
         """A loop entered the graph, and fits it."""
         self._add(EventKind.LOOP_CLOSED, f"keyframes {_pair(ends)}, {inliers} inliers")
 
+    def joined_by_marker(self, segment: int, other: int, marker: int) -> None:
+        """A marker that both segments saw joined them."""
+        text = f"segment {segment} into segment {other}, by marker {marker}"
+        self._add(EventKind.JOINED, text)
+
+    def marker_loop(self, ends: Ends, marker: int, off_m: float) -> None:
+        """A marker that was seen before closed a loop: it was ``off_m`` from its place."""
+        text = f"keyframes {_pair(ends)} by marker {marker}, which was {off_m:.3f} m off"
+        self._add(EventKind.LOOP_CLOSED, text)
+        self.count({"markers: loops": 1})
+
     def loop_refused(self, ends: Ends, reason: object) -> None:
         """A candidate, or a verified loop, is not closed."""
         self._add(EventKind.LOOP_REFUSED, f"keyframes {_pair(ends)}: {reason}")

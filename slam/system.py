@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,9 @@ import numpy as np
 from bmask_slam.back_end.config import BackEndConfig
 from bmask_slam.back_end.map_backend import MapBackend
 from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.back_end.marker_loops import join_by_markers
 from bmask_slam.features.brisk import BriskExtractor, Features
+from bmask_slam.features.marker_detection import MarkerDetector
 from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import fitting, nested, part
@@ -44,6 +46,7 @@ class SlamSystem(SensorSystem):
         moving_objects: keeps what moves out of tracking and out of the map.
         keyframes: decides which frames stay in the map.
         semantics: labels landmarks and finds objects.
+        markers: finds fiducial markers in keyframes; None where they are not looked for.
         stage_ms: wall time of each stage of the last frame, in milliseconds.
     """
 
@@ -78,6 +81,8 @@ class SlamSystem(SensorSystem):
         self.semantics = SemanticMapper(
             camera, config.semantics, self.map, segmenter, self.moving_objects.observe_masks
         )
+        markers = config.sensors.markers
+        self.markers = MarkerDetector(markers, config.features) if markers.enabled else None
         self.stage_ms: dict[str, float] = {}
         self._first_keyframe = 0  # of this session
 
@@ -211,8 +216,7 @@ class SlamSystem(SensorSystem):
     def _reported(self, tracked: Tracked) -> Tracked:
         """A tracked frame, once it is reported that it is lost, found again or begins a segment."""
         if not tracked.status.by_image:
-            reckoned = tracked.status is TrackingStatus.DEAD_RECKONING
-            self.events.lost(tracked.matches, reckoned)
+            self.events.lost(tracked.matches, tracked.status is TrackingStatus.DEAD_RECKONING)
         elif self.camera_tracker.reference is None:
             self.events.new_segment(self.camera_tracker.segment)
         else:
@@ -235,6 +239,8 @@ class SlamSystem(SensorSystem):
         reason = "" if restored else self.keyframes.reason(tracked)
         if not reason:
             return tracked, None, ""
+        if self.markers is not None and len((seen := self.markers.detect(frame, self.camera)).rows):
+            self.map.add_measurements(seen)
         return *self.insert(frame, tracked, self.camera_tracker.local_ids), reason
 
     @stage("graph")
@@ -256,11 +262,16 @@ class SlamSystem(SensorSystem):
         """Search the frame in other map segments; if it is recognised, they are joined."""
         world, tracker = self.map.world, self.camera_tracker
         others = [k for k in world.keyframes.values() if k.segment != tracker.segment]
-        recognised = tracker.recognise(tracked.features, others) if others else None
-        if recognised is None or not world.in_segment(tracker.segment):
+        if not others or not world.in_segment(tracker.segment):
             return tracked
-        joined = self.mapper.join(tracker.segment, tracked, recognised)
-        tracker.segment = world.segment_of(recognised.landmark_ids)
+        recognised = tracker.recognise(tracked.features, others)
+        if recognised is not None:
+            joined = self.mapper.join(tracker.segment, tracked, recognised)
+        elif (T := join_by_markers(self.mapper, tracker.segment)) is not None:
+            joined = replace(tracked, T_world_camera=T @ tracked.T_world_camera)
+        else:
+            return tracked
+        tracker.segment = world.segment_of(joined.landmark_ids)
         tracker.restart(joined.T_world_camera)
         return joined
 

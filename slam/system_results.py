@@ -16,6 +16,7 @@ from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import check_like, nested
 from bmask_slam.graph.inertial.tables import example_arrays
+from bmask_slam.graph.sensors.markers import MarkerMap
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud, MapObjects
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
@@ -25,9 +26,10 @@ from bmask_slam.run_folder.covariance_file import (
     find_covariances,
     write_covariances,
 )
+from bmask_slam.run_folder.landmark_file import MARKERS, write_markers
 from bmask_slam.run_folder.map_file import MAP, SavedRun, write_map
 from bmask_slam.run_folder.semantic_files import semantic_writers
-from bmask_slam.sensing.sensor_fusion import example_state
+from bmask_slam.sensing.carried_frames import example_state
 from bmask_slam.system_config import SystemConfig
 
 OLDER_ARRAYS = ("semantics.labels.counts", "semantics.objects.labels.counts")
@@ -109,6 +111,11 @@ class SystemResults(ABC):
         """The objects of the largest segment."""
         return self.semantics.map_objects(self.map.world.in_segment(largest(self.segments())))
 
+    def markers_found(self) -> MarkerMap:
+        """The fiducial markers of the largest segment."""
+        chosen, mapper = largest(self.segments()), self.mapper
+        return mapper.sensors.marker_map(mapper.smoother.tables, chosen)
+
     def files(self) -> dict[str, Callable[[Path], None]]:
         """Functions that write the files of the results, by file name."""
         found: dict[str, Callable[[Path], None]] = {
@@ -117,6 +124,8 @@ class SystemResults(ABC):
         }
         if self.semantics.enabled:
             found |= semantic_writers(self.landmarks(), self.objects(), self.trajectory())
+        if self.config.sensors.markers.enabled:
+            found[MARKERS] = lambda path: write_markers(path, self.markers_found())
         if self.config.covariances:
             found[COVARIANCES] = lambda path: write_covariances(path, self.keyframe_covariances())
         return found

@@ -12,7 +12,17 @@ import pytest
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import import_extra
 
-LIBRARIES = ("torch", "open3d", "safetensors", "libusb_package", "rerun", "ray", "rosbags", "shtab")
+LIBRARIES = (
+    "torch",
+    "open3d",
+    "safetensors",
+    "libusb_package",
+    "rerun",
+    "ray",
+    "rosbags",
+    "shtab",
+    "foxglove",
+)
 CALLS = """
 import contextlib, io, json, sys, time
 for name in LIBRARIES:
@@ -47,6 +57,7 @@ def answers(office: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
         "train": ["train", "--data", "a.json", "--images", "a", "--out", str(folder / "w")],
         "render": ["render", "office", "--out", str(folder / "office"), "--quiet"],
         "view": ["view", run, "--record", str(folder / "run.rrd")],
+        "view foxglove": ["view", run, "--foxglove", str(folder / "run.mcap")],
     }
     done = subprocess.run(
         [sys.executable, "-c", f"LIBRARIES = {LIBRARIES}\n{CALLS}"],
@@ -79,6 +90,7 @@ def test_the_core_needs_no_extra(answers: dict[str, list], name: str) -> None:
         ("train", "torch", "semantics"),
         ("render", "libusb_package", "render"),
         ("view", "rerun", "view"),
+        ("view foxglove", "foxglove", "foxglove"),
     ],
 )
 def test_what_is_missing_is_one_line_with_its_cure(

@@ -37,13 +37,14 @@ ROOMS = {
                tracking  loops  moving  runtime  sensing  back_end  labelling  system_config
                system_interface  run_folder  system_results  sensor_input  system  dense
                calibration  refinement  viewer  offline  merging  live  reporting  comparison  api
-               commands  cli  job_process  __init__  __main__""",
+               doctor  commands  cli  job_process  __init__  __main__""",
     "slam/sequences": "[...]  bags  formats  sequence  info  right_images  __init__",
     "slam/run_folder": "[...]  scene  export",
     "slam/rendering": "engine  things  rooms  [...]",
     "slam/dense": "[...]  growing",
-    "slam/live": """[...]  ros2  sources  processes  system  start  health  display
+    "slam/live": """[...]  ros2  sources  processes  network  system  start  health  display
                     recorder  live_map  live_slam  play""",
+    "slam/live/sources": "[...]  cameras  opening",
     "slam/comparison": "experiment  jobs  statistics  report  [...]",
 }
 MAX_MODULES, MAX_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS = 12, 300, 40, 6

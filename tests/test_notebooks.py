@@ -23,6 +23,7 @@ def test_a_notebook_runs_and_is_kept_without_its_output(path, tmp_path, monkeypa
     done = nbclient.NotebookClient(
         notebook,
         timeout=900,
+        iopub_timeout=900,
         kernel_name="python3",
         resources={"metadata": {"path": str(tmp_path)}},
     ).execute()

@@ -175,6 +175,60 @@ def test_every_shipped_configuration_is_in_the_wheel(installed: Environment) -> 
         installed.run("bmask-slam", "run", "-", "--config", path.stem, "--print-config")
 
 
+TUTORIAL = ROOT / "docs/tutorials/bag_to_nav2.md"
+COMMANDS = re.compile(r"^```\n(.*?)^```", re.DOTALL | re.MULTILINE)
+
+
+def make_bag(sequence: Path, path: Path) -> None:
+    """A recording as a ROS 2 bag, with the topics of a RealSense."""
+    import numpy as np
+    from recorded_bags import BagMaker, camera_info, image
+
+    from bmask_slam.sequences import open_sequence
+
+    recording, info = open_sequence(sequence), camera_info((0.0,) * 5)
+    camera = recording.camera
+    info.width, info.height, info.k = camera.width, camera.height, camera.K.ravel()
+    with BagMaker(path) as bag:
+        for frame in recording.frames():
+            stamp_s = 1000 + frame.timestamp_s
+            stored = np.nan_to_num(1000 * frame.depth_m).round().astype(np.uint16)
+            bag.write("/camera/color/camera_info", stamp_s, info)
+            bag.write("/camera/color/image_raw", stamp_s, image("rgb8", frame.rgb))
+            bag.write("/camera/aligned_depth_to_color/image_raw", stamp_s, image("16UC1", stored))
+
+
+def test_a_newcomers_path_from_pip_install_to_a_map_for_nav2(
+    installed: Environment, office: Path, tmp_path: Path
+) -> None:
+    """The tutorial's commands as they stand, by a shell, in the environment with the wheel alone.
+
+    ``pip`` finds the dependencies in the running environment and loads nothing.
+    """
+    make_bag(office, tmp_path / "drive.mcap")
+    pip = installed.path / "bin" / "pip"
+    python = f'"{sys.executable}" -m pip --python "{installed.path}/bin/python"'
+    pip.write_text(f'#!/bin/sh\nexec {python} "$@" --no-index\n', encoding="utf-8")
+    pip.chmod(0o755)
+    commands = COMMANDS.findall(TUTORIAL.read_text(encoding="utf-8"))
+    assert commands[0] == "pip install 'bmask-slam[ros2,view,dense]'\n"
+    words = ("info", "run", "map", "export", "view")
+    assert [text.split()[1] for text in commands[1:]] == list(words)
+    script = f'PATH="{installed.path}/bin:$PATH"\nset -e\n{"".join(commands)}'
+    told = _run(["sh", "-c", script], tmp_path)
+    assert "/camera/color/image_raw" in told
+    grid = dict(
+        line.split(": ", 1)
+        for line in (tmp_path / "drive.yaml").read_text().splitlines()
+        if ": " in line
+    )
+    assert float(grid["resolution"]) == pytest.approx(0.05)
+    data = (tmp_path / grid["image"].strip()).read_bytes()
+    cells = data.split(b"255\n", 1)[1]
+    assert {0, 254} <= set(cells)  # occupied and free
+    assert (tmp_path / "drive.rrd").stat().st_size > 10_000
+
+
 def _constraints() -> dict[str, str]:
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pins = [line.split("==") for line in lines if line and not line.startswith("#")]
@@ -195,7 +249,7 @@ def test_every_requirement_is_a_range_that_its_constraint_is_in() -> None:
     from packaging.requirements import Requirement
 
     pins = _constraints()
-    alone = ("realsense", "record3d")  # which are in no other extra
+    alone = ("realsense", "record3d", "oak", "azure")  # which are in no other extra
     extras = {k: v for k, v in EXTRAS.items() if k not in alone}
     for text in [*PROJECT["dependencies"], *(t for texts in extras.values() for t in texts)]:
         requirement = Requirement(text)
@@ -216,6 +270,7 @@ def test_every_import_is_a_declared_dependency() -> None:
         "mpl_toolkits": "matplotlib",
         "rerun": "rerun-sdk",
         "rerun_cli": "rerun-sdk",
+        "foxglove": "foxglove-sdk",
         "PIL": "pillow",
         "ruamel": "ruamel.yaml",
     }
@@ -239,7 +294,16 @@ def test_what_all_installs_has_the_packages_that_the_project_is_fixed_to() -> No
 
     (text,) = EXTRAS["all"]
     named = Requirement(text).extras
-    assert named == set(EXTRAS) - {"all", "dev", "docs", "realsense", "record3d", "ros2"}
+    assert named == set(EXTRAS) - {
+        "all",
+        "dev",
+        "docs",
+        "realsense",
+        "record3d",
+        "oak",
+        "azure",
+        "ros2",
+    }
     assert f"{PROJECT['name']}[all]" in EXTRAS["dev"]  # which make demo installs
     texts = [*PROJECT["dependencies"], *(text for name in named for text in EXTRAS[name])]
     installed = {_canonical(Requirement(text).name) for text in texts}

@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.graph.camera import Camera
-from bmask_slam.live.ros2.dds import LATCHED, SENSOR, STATE, Node, typestore
+from bmask_slam.live.ros2.dds import DdsNode
 from bmask_slam.live.ros2.messages import header, type_name
+from bmask_slam.live.ros2.transport import LATCHED, SENSOR, STATE, typestore
 from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.bags.ros_images import stamp_s
 
@@ -72,7 +73,7 @@ def camera_info(stamp: float, camera: Camera) -> Any:
 
 def play(path: Path, first: int, frames: int, rate_hz: float, domain: int) -> None:
     """Publish frames as a camera does; prints the stamp of each that is sent."""
-    sequence, node, quality = open_sequence(path), Node(domain), SENSOR._replace(reliable=True)
+    sequence, node, quality = open_sequence(path), DdsNode(domain), SENSOR._replace(reliable=True)
     colours, depths = (node.writer(t, type_name("Image"), quality) for t in (COLOUR, DEPTH))
     infos = node.writer(INFO, "sensor_msgs/msg/CameraInfo", LATCHED)
     infos.send(camera_info(time.time(), sequence.camera))
@@ -139,7 +140,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         str(QUIET_S),
         *options.live,
     ]
-    node, player = Node(domain), Player(options, domain)
+    node, player = DdsNode(domain), Player(options, domain)
     readers = {topic: node.reader(topic, type_name(k), q) for topic, (k, q) in HEARD.items()}
     heard: dict[str, list[float]] = defaultdict(list)
     live = subprocess.Popen(command)

@@ -24,11 +24,14 @@ LOOP, MARGINAL, ANCHOR = "loop", "marginal", "bridge"
 factor that the smoother adds to hold a keyframe (called a bridge in saved graphs)."""
 ODOMETRY, GRAVITY, POSITION, PLANAR = "odometry", "gravity", "position", "planar"
 """Kinds of relative poses that sensors measure."""
+MARKER, SITE = "marker", "site"
+"""Kinds of fiducial markers: one that a keyframe sees; its known pose in the frame of a site."""
 PARTIAL = (GRAVITY, POSITION, PLANAR)
 """Kinds that fix a part of a pose only: what they do not measure has a very large sigma."""
 FIRST_FRAME, FRAMES_OF_A_KIND = 1 << 40, 1 << 30
 """Reference frames (up is z) are poses of the graph with ids from here on, one a map segment;
-planes of motion have ids that are by so much larger."""
+planes of motion have ids that are by so much larger; markers and sites follow."""
+MARKERS_OF_A_SEGMENT = 1 << 14
 
 
 def _zeros(*shape: int) -> Array:
@@ -120,6 +123,24 @@ def reference_frame_id(segment: int) -> int:
 def plane_id(segment: int) -> int:
     """The id of the plane that a map segment's camera moves over, among the poses of the graph."""
     return FIRST_FRAME + FRAMES_OF_A_KIND + segment
+
+
+def marker_id(segment: int, number: int) -> int:
+    """The id of the marker ``number`` of a map segment, among the poses of the graph."""
+    return FIRST_FRAME + 2 * FRAMES_OF_A_KIND + segment * MARKERS_OF_A_SEGMENT + number
+
+
+def marker_of(pose_id: int) -> tuple[int, int] | None:
+    """Segment and number of a marker by its id; None for another pose."""
+    if not marker_id(0, 0) <= pose_id < site_id(0):
+        return None
+    segment, number = divmod(pose_id - marker_id(0, 0), MARKERS_OF_A_SEGMENT)
+    return segment, number
+
+
+def site_id(segment: int) -> int:
+    """The id of the frame in which poses of markers are known, among the poses of the graph."""
+    return FIRST_FRAME + 3 * FRAMES_OF_A_KIND + segment
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,8 @@ from bmask_slam.graph.arrays import Array, Arrays, Ints
 Name = tuple[str, int, int]
 """("imu", keyframe_a, keyframe_b), ("bias", keyframe, 0) or ("gravity", segment, 0)."""
 IMU, BIAS, GRAVITY = "imu", "bias", "gravity"
+_REPLACED = "replaced"
+"""In ISAM2 still, of two keyframes that have another factor now."""
 STATE = 9
 """A keyframe's velocity in the world, m/s, and the biases of its accelerometer, m/s^2, and its
 gyroscope, rad/s, in the IMU's frame."""
@@ -86,6 +88,7 @@ class InertialState:
         keyframe: its id. timestamp_s: its time.
         velocity: (3,) m/s. down: (3,) unit vector of gravity.
         bias: (6,) of the accelerometer, m/s^2, and the gyroscope, rad/s.
+        mounting: (8,) T_camera_imu in TUM's columns and the delay in s, where they were estimated.
     """
 
     keyframe: int
@@ -93,16 +96,19 @@ class InertialState:
     velocity: Array
     down: Array
     bias: Array
+    mounting: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def numbers(self) -> Array:
-        """All of it as (14,), for a file."""
-        return np.array([self.keyframe, self.timestamp_s, *self.velocity, *self.down, *self.bias])
+        """All of it as (14,) or (22,), for a file."""
+        motion = (*self.velocity, *self.down, *self.bias)
+        return np.array([self.keyframe, self.timestamp_s, *motion, *self.mounting])
 
     @classmethod
     def of(cls, numbers: Array) -> InertialState:
         """The state of ``numbers``."""
-        return cls(int(numbers[0]), float(numbers[1]), numbers[2:5], numbers[5:8], numbers[8:14])
+        known = numbers[2:5], numbers[5:8], numbers[8:14], numbers[14:]
+        return cls(int(numbers[0]), float(numbers[1]), *known)
 
 
 @dataclass(frozen=True)
@@ -164,9 +170,12 @@ class InertialTables:
         return bool(self.factors)
 
     def add(self, update: InertialUpdate) -> None:
-        """Remove and add factors, with the states that are given."""
+        """Remove and add factors, with the states that are given; one may replace another."""
         for pair in update.remove:
             self.factors.pop(pair, None)
+        for factor in update.factors:
+            if (slot := self.slots.pop(factor.name, None)) is not None:
+                self.slots[_REPLACED, factor.keyframe_a, factor.keyframe_b] = slot
         self.factors |= {(f.keyframe_a, f.keyframe_b): f for f in update.factors}
         self.states |= update.states
         self.down |= update.down
@@ -197,7 +206,7 @@ class InertialTables:
     def change(self) -> InertialChange:
         """What differs from what is in ISAM2; the slots of what goes are forgotten."""
         names, slots = self.names, self.slots
-        keyframes = {k for what, *pair in slots if what == IMU for k in pair}
+        keyframes = {k for what, *pair in slots if what in (IMU, _REPLACED) for k in pair}
         segments = {segment for what, segment, _ in slots if what == GRAVITY}
         gone = sorted(set(slots) - set(names))
         return InertialChange(

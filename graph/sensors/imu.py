@@ -30,7 +30,8 @@ class ImuConfig:
 
     Attributes:
         enabled: whether measurements are used.
-        imu_in_camera: T_camera_imu; p_camera = T_camera_imu @ p_imu.
+        imu_in_camera: T_camera_imu; p_camera = T_camera_imu @ p_imu. null: it is estimated, with
+            the delay, once the camera has turned enough; until then the IMU is not used.
         delay_s: the IMU's stamps are so much later than the camera's for the same moment.
         sigma_gyroscope, sigma_accelerometer: densities of white noise, rad/s/sqrt(Hz) and
             m/s^2/sqrt(Hz).
@@ -45,7 +46,7 @@ class ImuConfig:
     """
 
     enabled: bool = True
-    imu_in_camera: Mounting = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    imu_in_camera: Mounting | None = None
     delay_s: float = 0.0
     sigma_gyroscope: float = 1.75e-4
     sigma_accelerometer: float = 3e-3
@@ -60,10 +61,15 @@ class ImuConfig:
     max_blackout_s: float = 1.5
 
     @property
+    def T_camera_imu(self) -> Array:
+        """The mounting (4, 4); the camera itself where it is not given."""
+        return np.eye(4) if self.imu_in_camera is None else T_of(self.imu_in_camera)
+
+    @property
     def model(self) -> ImuModel:
         """The same as the factors have it."""
         return ImuModel(
-            T_of(self.imu_in_camera),
+            self.T_camera_imu,
             self.sigma_gyroscope,
             self.sigma_accelerometer,
             self.sigma_gyroscope_walk,
@@ -116,16 +122,16 @@ def begin(T_world_camera: Array, readings: Sequence[Array], config: ImuConfig) -
     velocities v then solve ``p_b = p_a + v_a t + R_a dp + g t^2 / 2`` and ``v_b = v_a + R_a dv +
     g t`` (dp, dv: the readings' integrals in frame a). None if that contradicts gravity's size.
     """
-    T = T_world_camera @ T_of(config.imu_in_camera)
+    T = T_world_camera @ config.T_camera_imu
     R, p, lever = T[:, :3, :3], T[:, :3, 3], T[:, :3, 3] - T_world_camera[:, :3, 3]
     times_s, bias = np.array([r[:, 0].sum() for r in readings]), np.zeros(3)
     for _ in range(_ITERATIONS):
-        turns = [_turned(r, bias)[-1] for r in readings]
+        turns = [turned(r, bias)[-1] for r in readings]
         off = so3_log(np.array(turns).mT @ R[:-1].mT @ R[1:])
         bias = bias - np.median(off / times_s[:, None], axis=0)
     A, b = np.zeros((len(readings), 2, 1 + len(T))), np.zeros((len(readings), 2, 3))
     for k, (rows, t) in enumerate(zip(readings, times_s.tolist(), strict=True)):
-        dv, dp = _integrals(rows, bias)
+        dv, dp = integrals(rows, bias)
         A[k, 0, [0, k + 1]] = t * t / 2, t
         A[k, 1, [0, k + 1, k + 2]] = t, 1.0, -1.0
         b[k] = p[k + 1] - p[k] - R[k] @ dp, -R[k] @ dv
@@ -142,7 +148,7 @@ def begin(T_world_camera: Array, readings: Sequence[Array], config: ImuConfig) -
     return Beginning(x[0] / size, states)
 
 
-def _turned(readings: Array, bias_rad_s: Array) -> Array:
+def turned(readings: Array, bias_rad_s: Array) -> Array:
     """Rotations (N + 1, 3, 3) of the IMU at the ends of readings (N, 10), from the first time."""
     R = [np.eye(3)]
     for step in so3_exp((readings[:, 4:7] - bias_rad_s) * readings[:, :1]):
@@ -150,10 +156,10 @@ def _turned(readings: Array, bias_rad_s: Array) -> Array:
     return np.array(R)
 
 
-def _integrals(readings: Array, bias_rad_s: Array) -> tuple[Array, Array]:
+def integrals(readings: Array, bias_rad_s: Array) -> tuple[Array, Array]:
     """The force's first and second integral over readings (N, 10), in the first IMU frame."""
     seconds = readings[:, :1]
-    middle = _turned(readings, bias_rad_s)[:-1] @ so3_exp(
+    middle = turned(readings, bias_rad_s)[:-1] @ so3_exp(
         (readings[:, 4:7] - bias_rad_s) * seconds / 2
     )
     steps = (middle @ readings[:, 1:4, None])[:, :, 0] * seconds

@@ -19,12 +19,19 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "accelerometer": ("timestamp", "ax", "ay", "az"),
     "position": ("timestamp", "x", "y", "z", "sigma"),
     "imu": ("timestamp", "wx", "wy", "wz", "ax", "ay", "az"),
+    "markers": (
+        *("timestamp", "id", "x0", "y0", "x1", "y1", "x2", "y2", "x3", "y3", "sigma"),
+        *(f"{name}{corner}" for name in ("w", "sw") for corner in range(4)),
+    ),
 }
 """The sensors and their columns: seconds, metres, unit quaternions, m/s^2. Odometry is T_odom_base,
 of which only the motion from one time to another is used; acceleration is specific force, which
 points up at rest; a position is that of the antenna in a local frame with z up (ENU), its sigma
-that of each coordinate; an IMU's rates w are in rad/s, its forces a in m/s^2."""
-FILES = {sensor: f"{sensor}.txt" for sensor in COLUMNS} | {"imu": "imu.csv"}
+that of each coordinate; an IMU's rates w are in rad/s, its forces a in m/s^2. Markers are found in
+images: their corners as `graph.sensors.markers.SeenCorners` has them."""
+KEYS = {"markers": 2}
+"""How many of the first columns name a row; 1 where it is the stamp."""
+FILES = {s: f"{s}.txt" for s in COLUMNS if s != "markers"} | {"imu": "imu.csv"}
 """The file of each sensor beside rgb.txt. The stamps of imu.csv are in nanoseconds, as EuRoC's."""
 UNITS_S = {"imu": 1e-9}
 """Of the stamps in a sensor's file, if they are not in seconds."""
@@ -50,8 +57,8 @@ def measurements(sensor: str, rows: ArrayLike, where: str = "") -> Measurements:
             rotation, no positive sigma, or stamps that do not rise.
     """
     where = where or f"add_{sensor}"
-    if sensor not in COLUMNS:
-        raise InputError(f"{sensor!r} is no sensor; use one of {', '.join(COLUMNS)}")
+    if sensor not in FILES:
+        raise InputError(f"{sensor!r} is no sensor; use one of {', '.join(FILES)}")
     names, table = COLUMNS[sensor], np.array(rows, float, ndmin=2)
     lacking = len(names) - table.shape[-1] if table.ndim == 2 else -1
     if not 0 <= lacking <= OPTIONAL.get(sensor, 0):
@@ -109,7 +116,7 @@ def read_folder(folder: Path | None, sensors: tuple[str, ...]) -> list[Measureme
     """
     if folder is None:
         return []
-    files = {sensor: folder / FILES[sensor] for sensor in sensors}
+    files = {sensor: folder / FILES[sensor] for sensor in sensors if sensor in FILES}
     found = []
     for sensor, file in files.items():
         if file.is_file():
@@ -158,7 +165,8 @@ class SensorStreams:
             self.rows[new.sensor] = self._appended(new.sensor, known, new.rows)
             return
         merged = np.concatenate([known, new.rows])
-        _, first = np.unique(merged[:, 0], return_index=True)
+        keys = merged[:, : KEYS.get(new.sensor, 1)]
+        _, first = np.unique(keys, axis=0, return_index=True)
         self.rows[new.sensor] = merged[first]
 
     def _appended(self, sensor: str, known: Array, later: Array) -> Array:

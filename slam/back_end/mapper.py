@@ -22,6 +22,7 @@ from bmask_slam.back_end.landmark_management import (
     restore_observations,
 )
 from bmask_slam.back_end.map_backend import add_keyframe
+from bmask_slam.back_end.marker_loops import close_marker_loops
 from bmask_slam.back_end.pruning import MapPruner
 from bmask_slam.back_end.segment_joining import anchors, join_segment
 from bmask_slam.back_end.triangulation import triangulate_landmarks
@@ -36,6 +37,7 @@ from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.loops.closing import LoopCloser
 from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.sensing.marker_sightings import only_witnesses
 from bmask_slam.sensing.sensor_fusion import SensorFusion
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.results import Tracked
@@ -76,15 +78,8 @@ class Mapper:
         """The index that finds keyframes similar to a frame."""
         return self.loops.index
 
-    @property
-    def idle(self) -> bool:
-        """Whether it waits for work: always, since updates end before the next frame."""
-        return True
-
-    @property
-    def accepts_keyframes(self) -> bool:
-        """Whether a keyframe will be worked on: always."""
-        return True
+    idle = accepts_keyframes = True
+    """Whether it waits for work, and will work on a keyframe: updates end before the next frame."""
 
     def state(self) -> Arrays:
         """Map, history and graph as named arrays."""
@@ -148,12 +143,13 @@ class Mapper:
 
     def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
         """Close a keyframe's loops that are confirmed; those that do not fit wait for more."""
+        close_marker_loops(self)
         confirmed = self.loops.loops_of(keyframe, self.world)
         return self.close(confirmed) if confirmed else []
 
     def close(self, confirmed: list[LoopConstraint]) -> list[LoopConstraint]:
         """Close loops that confirm each other; returns those that fit the graph."""
-        self._change_graph(relative_poses=self.loops.relative_poses(confirmed))
+        self.change_graph(relative_poses=self.loops.relative_poses(confirmed))
         believed = self.loops.is_strong(confirmed)
         self.loops.closed |= {loop.ends: believed for loop in confirmed}
         refuted = self._remove_wrong_loops({loop.ends for loop in confirmed})
@@ -162,11 +158,15 @@ class Mapper:
         for loop in kept:
             self.events.loop_closed(loop.ends, loop.inliers)
         if kept:
-            count, world = self.loops.config.fuse_keyframes, self.world
-            fused = fuse_loops(world, kept, self._tracker, self._mapping, count)
-            self._factor_selector.remove_landmarks(fused)
-            self._change_graph()
+            self.fuse(kept)
         return kept
+
+    def fuse(self, loops: list[LoopConstraint]) -> None:
+        """Fuse the landmarks of both sides of loops, and optimise."""
+        count = self.loops.config.fuse_keyframes
+        fused = fuse_loops(self.world, loops, self._tracker, self._mapping, count)
+        self._factor_selector.remove_landmarks(fused)
+        self.change_graph()
 
     def join(self, segment: int, tracked: Tracked, recognised: Tracked) -> Tracked:
         """Move a segment into another one in which a frame of it was recognised.
@@ -223,6 +223,7 @@ class Mapper:
         """Full bundle adjustment, again without outliers; the map is then final."""
         if self.world.keyframes:
             self.add_waiting_measurements(last=True)
+            close_marker_loops(self)
             self._apply(self.smoother.optimise_batch(drop_outliers=True), timed=False)
             self.sensors.report(self.smoother)
 
@@ -251,11 +252,10 @@ class Mapper:
         read_back(self.world, estimate)
         self.sensors.follow(self)
 
-    def _change_graph(self, **changes: Any) -> None:
+    def change_graph(self, **changes: Any) -> None:
         """An update that moves much of the graph: ISAM2 is iterated until it converges."""
-        rounds = self.loops.config.max_iterations
-        update = self._factor_selector.map_update(self.world)
-        update = replace(update, max_iterations=rounds, **changes)
+        changes["max_iterations"] = self.loops.config.max_iterations
+        update = replace(self._factor_selector.map_update(self.world), **changes)
         self._apply(self.smoother.update(update))
 
     def _remove_wrong_loops(self, fresh: set[Ends]) -> set[Ends]:
@@ -268,12 +268,11 @@ class Mapper:
                 return removed
             removed |= refuted
             new = tuple((a, b, "loop") for a, b in sorted(refuted & fresh))
+            reason = "it does not fit the graph; waits until more agree"
             for a, b, _ in new:
-                self.events.loop_refused(
-                    (a, b), "it does not fit the graph; waits until more agree"
-                )
+                self.events.loop_refused((a, b), reason)
             self.events.count({"loops pruned: refuted": len(new)})
-            self._change_graph(remove_relative_poses=new)
+            self.change_graph(remove_relative_poses=new)
             for ends in sorted(refuted - fresh):
                 self.events.loop_removed(ends)
                 self.events.count(self.pruner().prune_loop(*ends).counts("refuted"))
@@ -288,7 +287,8 @@ class Mapper:
         """
         _, landmark_ids = self.world.observed(newest)
         tables = self.smoother.tables
-        kept = self.loops.ends | {0} | tables.own_keyframes | tables.marginalised.bases
+        kept = self.loops.ends | {0} | tables.own_keyframes | only_witnesses(tables)
+        kept |= tables.marginalised.bases
         near = {k.id: k for _, k in self.world.covisible(landmark_ids, 15)}
         old = [near[i] for i in sorted(near.keys() - kept, reverse=True) if i < newest.id - 2]
         redundant = redundant_keyframe(self.world, old, self._mapping)

@@ -6,18 +6,20 @@ import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, get_args
+
+from bmask_slam.graph.errors import InputError
 
 if TYPE_CHECKING:
     from bmask_slam.evaluation import Row
     from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
     from bmask_slam.sequences.bags.topics import BagTopics
     from bmask_slam.system_config import SystemConfig
-    from bmask_slam.viewer.scene import ViewOptions
+    from bmask_slam.viewer.options import ViewOptions
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
-WEB_PORT = 9090
+WEB_PORT, FOXGLOVE_PORT = 9090, 8765
 DETAILS = (
     *("rpe_trans_rmse_frame", "rpe_rot_rmse_frame", "ate_rot_rmse", "tracking_ms_p95"),
     *("isam2_update_ms_median", "isam2_update_ms_p95", "latency_ms_p95"),
@@ -126,6 +128,8 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", metavar="F", help=text)
     text = "one value of the configuration, such as tracking.min_inliers=20; may be repeated"
     parser.add_argument("--set", metavar="A.B=C", action="append", default=[], help=text)
+    text = "use fiducial markers, such as APRILTAG_36h11:0.16 or 4X4_50 (size by depth)"
+    parser.add_argument("--markers", metavar="DICT[:SIZE_M]", help=text)
 
 
 def chosen_config(arguments: argparse.Namespace) -> ChosenConfig:
@@ -134,15 +138,31 @@ def chosen_config(arguments: argparse.Namespace) -> ChosenConfig:
     from bmask_slam.system_config import SystemConfig
 
     file = find_config(arguments.config) if arguments.config else None
-    plain = resolve(SystemConfig, file, arguments.set)
+    settings = [*arguments.set, *_marker_settings(getattr(arguments, "markers", None))]
+    plain = resolve(SystemConfig, file, settings)
     segmenter = segmenter_options(arguments, plain.semantics.segmenter)
     config = replace(plain, semantics=replace(plain.semantics, segmenter=segmenter))
-    is_default = not (file or arguments.set) and config == plain
+    is_default = not (file or settings) and config == plain
     return ChosenConfig(config, file.stem if file else "", is_default)
 
 
+def _marker_settings(markers: str | None) -> list[str]:
+    """The settings that --markers stands for; the dictionary's name in any case, with DICT_ too."""
+    from bmask_slam.graph.sensors.markers import Dictionary
+
+    if markers is None:
+        return []
+    given, _, size_m = markers.partition(":")
+    names = {name.upper(): name for name in get_args(Dictionary)}
+    name = names.get(given.upper().removeprefix("DICT_"))
+    if name is None:
+        raise InputError(f"--markers {given}: no dictionary; choose of {', '.join(names.values())}")
+    settings = ["sensors.markers.enabled=true", f"sensors.markers.dictionary='{name}'"]
+    return [*settings, f"sensors.markers.size_m={size_m}"] if size_m else settings
+
+
 def add_view_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add where it goes: --record, or --serve and --host."""
+    """Add where it goes: --record or --serve, --foxglove, and --host."""
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--record", type=Path, metavar="F.rrd", help="write a Rerun recording")
     where.add_argument(
@@ -155,20 +175,40 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"show it in a browser (port {WEB_PORT})",
     )
     parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        metavar="ADDRESS",
-        help="address that --serve listens on; others than this machine's own let everyone in",
+        "--foxglove",
+        nargs="?",
+        const=str(FOXGLOVE_PORT),
+        metavar="PORT|F.mcap",
+        help=f"for Foxglove: a websocket (port {FOXGLOVE_PORT}), or a file F.mcap",
     )
+    text = "address that --serve and --foxglove listen on; others than this machine's own let "
+    text += "everyone in"
+    parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help=text)
 
 
 def view_options(arguments: argparse.Namespace, window: bool) -> ViewOptions:
     """What was asked for; ``window``: Rerun's own window, if nothing else was."""
-    from bmask_slam.viewer.scene import ViewOptions
+    from bmask_slam.viewer.options import ViewOptions
 
-    other_output = arguments.record is not None or arguments.serve > 0
-    window = window and not other_output
-    return ViewOptions(arguments.record, arguments.serve, window, arguments.host)
+    file, port = _foxglove(arguments.foxglove)
+    elsewhere = arguments.record is not None or arguments.serve > 0
+    if "view" not in arguments:  # the command that shows has a window unless told otherwise
+        elsewhere |= arguments.foxglove is not None
+    window = window and not elsewhere
+    return ViewOptions(arguments.record, arguments.serve, window, arguments.host, file, port)
+
+
+def _foxglove(text: str | None) -> tuple[Path | None, int]:
+    """The file, or the port, of --foxglove."""
+    from bmask_slam.graph.errors import InputError
+
+    if text is None:
+        return None, 0
+    if text.lower().endswith(".mcap"):
+        return Path(text), 0
+    if text.isdecimal() and 0 < int(text) < 65536:
+        return None, int(text)
+    raise InputError(f"--foxglove {text}: give a port, or a file that ends with .mcap")
 
 
 def format_summary(rows: list[Row]) -> str:

@@ -29,9 +29,8 @@ from bmask_slam.graph.errors import InputError
 if TYPE_CHECKING:
     from bmask_slam.graph.sensors.streams import Measurements
     from bmask_slam.live.live_slam import LiveOptions, LiveSlam
-    from bmask_slam.live.play import Listener
+    from bmask_slam.live.network.workstation import Workstation
     from bmask_slam.live.sources.opening import SourceOptions
-    from bmask_slam.live.sources.ros2_source import Ros2Source
     from bmask_slam.live.sources.source import Source
     from bmask_slam.system_config import SystemConfig
 
@@ -40,16 +39,20 @@ MORE = """\
 Tracking is here; the map with its graph and loops, segmentation and the dense map have processes
 of their own. The run folder is that of `run`, with health.json, which is rewritten every second."""
 
+WORKSTATION = """\
+Has the map and makes the masks for robots that run `bmask-slam live SOURCE --workstation HOST`.
+Only who knows the token is served, and can then run code here. What is sent is not encrypted."""
 SENSORS = ("imu", "odometry", "position", "accelerometer")
 SOURCE_HELP = """\
-recording in any layout of docs/data.md, ROS 1 .bag, ROS 2 bag folder, .mcap, realsense: for the
-RealSense that is plugged in, opencv:N for device N of OpenNI 2, or ros2: (ros2:DOMAIN)"""
+recording in any layout of docs/data.md, ROS 1 .bag, ROS 2 bag folder, .mcap; a camera that is
+plugged in: realsense:, oak:, azure:, record3d:, opencv:N (device N of OpenNI 2); or ros2:
+(ros2:DOMAIN)"""
 
 
 def add_live(commands: Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser("live", help=TEXT, description=f"{TEXT}. {MORE}")
-    parser.set_defaults(handler=_live)
+    parser.set_defaults(handler=_live, ros2_node=None)  # a program with a node of its own sets it
     parser.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
     parser.add_argument("--out", type=Path, help="run folder (default: runs/<source>, numbered)")
     parser.add_argument("--overwrite", action="store_true", help="replace the run that --out holds")
@@ -59,6 +62,9 @@ def add_live(commands: Commands) -> None:
         help="play a recording at its own speed, dropping frames that there is no time for",
     )
     _add_source_arguments(parser)
+    text = "machine that has the map and makes the masks: bmask-slam workstation runs there"
+    parser.add_argument("--workstation", metavar="HOST[:PORT]", help=text)
+    _add_token_argument(parser)
     add_config_arguments(parser)
     add_camera_argument(parser)
     text = "find readout, depth delay and bend while it runs; auto, the default: use them"
@@ -72,6 +78,45 @@ def add_live(commands: Commands) -> None:
     parser.add_argument("--view", action="store_true", help="show it in Rerun's window")
     add_view_arguments(parser)
     add_output_arguments(parser, "the run folder's path")
+
+
+def add_workstation(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "workstation",
+        help="have map and masks for a robot that runs live --workstation",
+        description=WORKSTATION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(handler=_workstation)
+    text = "address to listen on (default: 127.0.0.1, for this machine only)"
+    parser.add_argument("--host", default="127.0.0.1", help=text)
+    parser.add_argument("--port", type=int, default=7717, help="(default: 7717)")
+    _add_token_argument(parser)
+
+
+def _add_token_argument(parser: argparse.ArgumentParser) -> None:
+    text = "secret that robot and workstation share (default: ~/.config/bmask-slam/token)"
+    parser.add_argument("--token-file", type=Path, metavar="F", help=text)
+
+
+def _workstation(arguments: argparse.Namespace) -> int:
+    from bmask_slam.live.network.connection import default_token_file, make_token, read_token
+    from bmask_slam.live.network.server import WorkstationServer
+    from bmask_slam.runtime.stop_request import StopRequest
+
+    path = arguments.token_file or default_token_file()
+    if not path.exists():
+        make_token(path)
+        print(f"a new token is in {path}; copy it to the robot", file=sys.stderr)
+    if not 0 <= arguments.port < 1 << 16:
+        raise InputError(f"--port {arguments.port}: no port")
+    server = WorkstationServer(arguments.host, arguments.port, read_token(path))
+    print(f"listening on {arguments.host}:{server.port}; Ctrl-C ends it", flush=True)
+    with StopRequest() as stop:
+        server.serve(lambda: stop.signal is not None)
+    server.close()
+    return 128 + stop.signal if stop.signal else 0
 
 
 def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
@@ -110,6 +155,7 @@ def source_options(arguments: argparse.Namespace) -> SourceOptions:
         topics=bag_topics(arguments),
         reliable=arguments.reliable,
         sensors=sensors,
+        node=arguments.ros2_node,
     )
 
 
@@ -118,25 +164,56 @@ def _sensor_topics(arguments: argparse.Namespace) -> dict[str, str]:
 
 
 def _live(arguments: argparse.Namespace) -> int:
+    from bmask_slam.live.sources.opening import open_source
+
+    with closing(open_source(arguments.source, source_options(arguments))) as source:
+        return _live_on(arguments, source)
+
+
+def _live_on(arguments: argparse.Namespace, source: Source) -> int:
+    """The command on a source that is open: one run, over ROS 2 others when that is asked for."""
     from bmask_slam.live.live_slam import LiveSlam
-    from bmask_slam.live.play import PlayOptions, play
-    from bmask_slam.live.sources.opening import open_source, ros2_of
+    from bmask_slam.live.play import PlayOptions, play, ros2_ends
+    from bmask_slam.live.sources.opening import ros2_of
 
     config = chosen_config(arguments).config
-    with closing(open_source(arguments.source, source_options(arguments))) as source:
-        options, ros2 = _live_options(arguments, source), ros2_of(source)
-        if ros2 is not None:
-            config = replace(config, sensors=ros2.mounted(config.sensors))
+    options, ros2 = _live_options(arguments, source), ros2_of(source)
+    if ros2 is not None:
+        config = replace(config, sensors=ros2.mounted(config.sensors))
+    listener, services = (None, None) if ros2 is None else ros2_ends(ros2, arguments.ros2_params)
+    told = PlayOptions(not source.waits, quiet=arguments.quiet)
+    before: Path | None = None
+    while True:
         with LiveSlam(source.camera, config, options) as slam:
             slam.source_counts = source.counts
             if ros2 is not None:
                 ros2.deliver = slam.add_measurements
             for measured in measured_beside(arguments, options.images, config):
                 slam.add_measurements(measured)
-            if slam.viewer_url:
-                print(f"in a browser: {slam.viewer_url}", file=sys.stderr, flush=True)
-            told = PlayOptions(not source.waits, quiet=arguments.quiet)
-            ended_by = play(slam, source, told, ros2_listener(arguments, ros2))
+            for address in slam.viewer_addresses:
+                print(address, file=sys.stderr, flush=True)
+            if services is not None and services.reset_asked:
+                services.begin(before, slam.out)
+            ended_by = play(slam, source, told, listener, services)
+        if ended_by or services is None or not services.reset_asked:
+            return _tell(arguments, slam, source, ended_by)
+        before, options = slam.out, _next_run(options)
+
+
+def _next_run(options: LiveOptions) -> LiveOptions:
+    """Those of a run that begins where another has ended: with a folder of its own."""
+    from bmask_slam.run_folder.open_files import free_run_path
+
+    assert options.out is not None
+    return replace(
+        options, out=free_run_path(options.out.name, options.out.parent), overwrite=False
+    )
+
+
+def _tell(
+    arguments: argparse.Namespace, slam: LiveSlam, source: Source, ended_by: int | None
+) -> int:
+    """Print what came of a run; returns the exit code."""
     found: dict[str, Any] = {
         "folder": slam.out,
         "calibration": slam.calibration,
@@ -171,30 +248,6 @@ def measured_beside(
     )
 
 
-def ros2_listener(arguments: argparse.Namespace, source: Ros2Source | None) -> Listener | None:
-    """What publishes the results, where the frames come from ROS 2."""
-    from bmask_slam.config.configuration import resolve
-    from bmask_slam.live.ros2.outputs import OPTICAL, Robot, Ros2Frames
-    from bmask_slam.live.ros2.publisher import Ros2Publisher
-
-    if source is None:
-        return None
-    frames = resolve(Ros2Frames, arguments.ros2_params)
-    T, by_tf = frames.T_base_camera, False
-    if T is None:
-        T = source.T_base_camera(frames.base)
-        by_tf = T is not None
-    wheels = "odometry" in source.sensors.names
-    robot = Robot(
-        OPTICAL if T is None else T,
-        T is not None,
-        by_tf,
-        source.sensors.T_odom_base if wheels else None,
-        source.ros_time,
-    )
-    return Ros2Publisher(source.node, frames, robot)
-
-
 def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
     """Where the run is written, and what the source says about itself."""
     from bmask_slam.live.live_slam import LiveOptions
@@ -223,7 +276,18 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
         calibrate=arguments.calibrate,
         straightens=True,
         interpolates=source.interpolates,
+        workstation=_workstation_of(arguments),
     )
+
+
+def _workstation_of(arguments: argparse.Namespace) -> Workstation | None:
+    from bmask_slam.live.network.workstation import Workstation
+
+    if arguments.workstation is None:
+        return None
+    if arguments.ray:
+        raise InputError("--ray: the masks are made on the workstation; leave one of both out")
+    return Workstation.of(arguments.workstation, arguments.token_file)
 
 
 def _summary(slam: LiveSlam, source: Source) -> str:

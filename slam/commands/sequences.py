@@ -52,7 +52,9 @@ def add_render(commands: Commands) -> None:
         "--depth-delay-ms", type=float, default=0.0, metavar="MS", help="depth taken so much later"
     )
     parser.add_argument("--sweeping", action="store_true", help="tilt and roll, as to calibrate")
-    text = "also of odometry,position,accelerometer: files beside the images"
+    text = (
+        "also odometry,position,accelerometer,imu: files beside the images; markers: on the walls"
+    )
     parser.add_argument("--sensors", default="", metavar="S,S", help=text)
     parser.add_argument("--true-depth", action="store_true", help="also write noise-free depth")
     parser.add_argument("--normals", action="store_true", help="also write surface normals")

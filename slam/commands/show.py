@@ -1,8 +1,9 @@
-"""``bmask-slam view``, ``report`` and ``film``: a run in Rerun, as a web page, as a film."""
+"""``view``, ``report``, ``film``, ``doctor``: a run in a viewer, as page or film; the machine."""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
 from bmask_slam.commands.arguments import (
@@ -13,10 +14,11 @@ from bmask_slam.commands.arguments import (
     view_options,
 )
 
-VIEW = "show a finished run in Rerun"
+VIEW = "show a finished run in Rerun or Foxglove"
 VIEW_MORE = """\
 The map with labels and objects, the camera's path, loops, the dense cloud where there is one, and
-status and times of every frame. Needs  pip install 'bmask-slam[view]'."""
+status, times and uncertainty of every frame; its images, and masks of keyframes made anew, where
+the recording is still there. Needs  pip install 'bmask-slam[view]', or [foxglove]."""
 REPORT = "write a web page about a run: figures, warnings, plots, pictures"
 REPORT_MORE = """\
 One file that needs no network: open it in any browser, send it by mail. Also for a run that goes on
@@ -26,6 +28,13 @@ FILM_MORE = """\
 With the camera's path and the objects by name. The map is the dense one if there is one, else it is
 made of the film's depth images. A .gif or .webp begins again at its end. Give it after the run:
 the next report shows it."""
+DOCTOR = "say what is installed, which cameras are there, and how fast this machine is"
+DOCTOR_MORE = """\
+Loads every library that is installed, asks every camera library for its cameras, looks at memory,
+disk and limits, and measures tracking, iSAM2 and the network for a few seconds; says what each
+extra that is not there is for, what it costs, and the command. Exit status: 0 if nothing is wrong
+(an extra or a camera that is not there is no fault), 1 if the core lacks a library, an installed
+one cannot be loaded, or memory, disk or open files are too few for a run."""
 
 
 def add_view(commands: Commands) -> None:
@@ -33,19 +42,28 @@ def add_view(commands: Commands) -> None:
     parser = commands.add_parser("view", help=VIEW, description=f"{VIEW}. {VIEW_MORE}")
     parser.set_defaults(handler=_view)
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a finished run")
+    parser.add_argument("--sequence", type=Path, metavar="DIR", help="its images, if they moved")
+    parser.add_argument("--no-images", action="store_true", help="show the map and plots alone")
     add_view_arguments(parser)
 
 
 def _view(arguments: argparse.Namespace) -> int:
-    from bmask_slam.viewer.replay import replay
+    from bmask_slam.viewer.replay import ReplayOptions, replay
     from bmask_slam.viewer.scene import Scene
 
-    scene = Scene(arguments.run.name, view_options(arguments, window=True))
-    count = replay(arguments.run, scene)
-    print(f"{count} frames of {arguments.run}")
+    where = view_options(arguments, window=True)
+    scene = Scene(arguments.run.name, where)
+    options = ReplayOptions(
+        arguments.sequence, not arguments.no_images, paced=where.foxglove_port > 0
+    )
     try:
-        if arguments.serve:
-            print(f"in a browser: {scene.url}  (Ctrl-C ends it)", flush=True)
+        for address in scene.addresses:
+            print(f"{address}  (Ctrl-C ends it)", flush=True)
+        count = replay(arguments.run, scene, options)
+        print(f"{count} frames of {arguments.run}", flush=True)
+        while where.foxglove_port:  # again and again, for who connects later
+            replay(arguments.run, scene, options)
+        if where.serve:
             _wait()
     finally:
         scene.close()
@@ -108,3 +126,25 @@ def _film(arguments: argparse.Namespace) -> int:
         film = write_film(options, progress)
     print_result(arguments, film, lambda: f"Film        {film}", {"film": film})
     return 0
+
+
+def add_doctor(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser("doctor", help=DOCTOR, description=f"{DOCTOR}. {DOCTOR_MORE}")
+    parser.set_defaults(handler=_doctor)
+    parser.add_argument("--quick", action="store_true", help="do not measure the speed")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from bmask_slam.doctor.checkup import check, format_checkup
+
+    found = check(with_speed=not arguments.quick)
+    if arguments.json:
+        from bmask_slam.graph.files.json_file import format_json  # needs numpy, which may be broken
+
+        told = found.speed.expectations() if found.speed else []
+        print(format_json(asdict(found) | {"expectations": told}))
+    else:
+        print(format_checkup(found))
+    return 1 if found.problems else 0

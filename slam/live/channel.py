@@ -1,8 +1,8 @@
 """Messages between two processes over a socket, with one thread for each direction.
 
-Messages are pickled; large arrays in them go through shared memory. Neither side waits for the
-other: there is a queue of messages to send and one of received messages. The channel ends when the
-other process does, for whatever reason.
+Messages are pickled; large arrays in them go through shared memory, if the processes have some.
+Neither side waits for the other: there is a queue of messages to send and one of received messages.
+The channel ends when the other process does, for whatever reason.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ import queue
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, Protocol
 
 from bmask_slam.live.shared_memory import Ring
 
@@ -25,7 +24,23 @@ logger = logging.getLogger(__name__)
 
 LARGE = 1 << 15
 """Bytes from which on an array goes through shared memory."""
-_END = object()
+END = object()
+"""Put behind the last message."""
+
+
+class Connection(Protocol):
+    """What carries pickles and their buffers, as multiprocessing's Connection does."""
+
+    def fileno(self) -> int: ...
+    def send(self, obj: Any, /) -> None: ...
+    def recv(self) -> Any: ...
+
+
+class Queue(Protocol):
+    """What holds messages until they are sent."""
+
+    def put(self, item: Any, /) -> None: ...
+    def get(self) -> Any: ...
 
 
 class Channel:
@@ -35,13 +50,21 @@ class Channel:
         open: False once the other side has ended or this one was closed.
     """
 
-    def __init__(self, connection: Connection, rings: tuple[Ring, Ring]) -> None:
-        """Use a connection, and the rings to write to and to read from."""
+    def __init__(
+        self,
+        connection: Connection,
+        rings: tuple[Ring, Ring] | None,
+        outbox: Queue | None = None,
+    ) -> None:
+        """Use a connection, and the rings to write to and to read from, if there are some.
+
+        ``outbox``: holds what is to be sent, if not in its order.
+        """
         self.open = True
         self._connection = connection
-        self._outgoing, self._incoming = rings
+        self._rings = rings
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._outbox: Queue = queue.SimpleQueue() if outbox is None else outbox
         self._sender = threading.Thread(target=self._send_all, daemon=True)
         self._reader = threading.Thread(target=self._read_all, daemon=True)
         self._sender.start()
@@ -59,20 +82,20 @@ class Channel:
             while True:
                 left_s = 0.0 if found else max(deadline_s - time.monotonic(), 0.0)
                 message = self._inbox.get(block=left_s > 0.0, timeout=left_s or None)
-                if message is _END:
-                    self._inbox.put(_END)
+                if message is END:
+                    self._inbox.put(END)
                     break
                 found.append(message)
         return found
 
     def messages(self) -> Iterator[Any]:
         """Each message as it arrives, until the other side ends."""
-        while (message := self._inbox.get()) is not _END:
+        while (message := self._inbox.get()) is not END:
             yield message
 
     def finish(self, timeout_s: float = 5.0) -> None:
         """Send the queued messages, then end this direction."""
-        self._outbox.put(_END)
+        self._outbox.put(END)
         self._sender.join(timeout_s)
 
     def drain(self, timeout_s: float = 1.0) -> None:
@@ -82,11 +105,11 @@ class Channel:
     def close(self) -> None:
         """End both directions at once."""
         self.open = False
-        self._outbox.put(_END)
+        self._outbox.put(END)
         self._shutdown(socket.SHUT_RDWR)
 
     def _send_all(self) -> None:
-        while (message := self._outbox.get()) is not _END:
+        while (message := self._outbox.get()) is not END:
             try:
                 self._connection.send(self._pack(message))
             except OSError:  # the other side has ended
@@ -107,9 +130,9 @@ class Channel:
         except Exception:  # a message that this side cannot read, as after a change of its files
             logger.exception("a message between processes cannot be read")
         self.open = False
-        self._inbox.put(_END)
+        self._inbox.put(END)
 
-    def _pack(self, message: Any) -> tuple[bytes, list[bytes | tuple[int, int]]]:
+    def _pack(self, message: Any) -> tuple[bytes, Sequence[Any]]:
         """The pickled message and its large buffers: (position, size) in the ring, or bytes."""
         buffers: list[memoryview] = []
 
@@ -121,15 +144,19 @@ class Channel:
             return False
 
         data = pickle.dumps(message, protocol=5, buffer_callback=keep_small)
-        places = ((self._outgoing.write(raw), raw) for raw in buffers)
+        if self._rings is None:
+            return data, buffers
+        places = ((self._rings[0].write(raw), raw) for raw in buffers)
         return data, [bytes(raw) if at is None else (at, raw.nbytes) for at, raw in places]
 
-    def _unpack(self, data: bytes, places: list[bytes | tuple[int, int]]) -> Any:
+    def _unpack(self, data: bytes, places: Sequence[Any]) -> Any:
         buffers = [
-            bytearray(place) if isinstance(place, bytes) else self._incoming.read(*place)
+            bytearray(place)
+            if self._rings is None or isinstance(place, bytes)
+            else self._rings[1].read(*place)
             for place in places
         ]
-        return pickle.loads(data, buffers=buffers)  # nosec B301 # of a child, over a socket pair
+        return pickle.loads(data, buffers=buffers)  # nosec B301 # of a child, or authenticated
 
     def _shutdown(self, how: int) -> None:
         with suppress(OSError), socket.socket(fileno=os.dup(self._connection.fileno())) as end:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Image
+from bmask_slam.labelling.results import MapObjects
 from bmask_slam.live.health import Health
+from bmask_slam.live.messages import Masks
 from bmask_slam.live.system import LiveSystem
+from bmask_slam.semantics.instances.overlay import class_colour
 from bmask_slam.tracking.results import FrameResult
 from bmask_slam.viewer.scene import Scene
+from bmask_slam.viewer.shown import Box, as_jpeg
 from bmask_slam.world.world_map import WorldMap
 
 if TYPE_CHECKING:  # it loads torch
@@ -19,6 +24,10 @@ if TYPE_CHECKING:  # it loads torch
 
 IMAGE_EVERY = 3
 """Interval in frames of images that are shown."""
+OBJECTS_S = 3.0
+"""Interval at which the map is asked for its objects."""
+MAX_UNSEGMENTED = 8
+"""Largest number of keyframes whose images wait for their masks."""
 MOVED_AT_ONCE = 10
 """Largest number of submaps that are moved at a frame; the others follow at the next frames."""
 PARTS_AT_ONCE = 1
@@ -35,11 +44,31 @@ class Display:
         self._frames = self._changes = 0
         self._placed: dict[int, Array] = {}
         self._to_move: list[int] = []
+        self._names: tuple[str, ...] = ()
+        self._unsegmented: dict[int, bytes] = {}
+        self._asked_s = 0.0
+        self._objects: MapObjects | None = None
+
+    def follow(self, system: LiveSystem) -> None:
+        """Show the masks of a system's keyframes as they arrive."""
+        self._names = system.label_names
+        self._scene.log_names(self._names)
+        system.mask_listeners.append(self.masks)
+
+    def masks(self, found: Masks) -> None:
+        """Show a keyframe's image with its masks."""
+        jpeg = self._unsegmented.pop(found.keyframe_id, None)
+        if jpeg is not None:
+            self._scene.log_masks(jpeg, found.instances, self._names)
 
     def frame(self, result: FrameResult, rgb: Image, system: LiveSystem) -> bool:
         """Show a frame, and some changes of the submaps; returns whether the map has changed."""
         self._frames += 1
         self._scene.log_frame(result, rgb if self._frames % IMAGE_EVERY == 1 else None)
+        if result.keyframe_id is not None and system.segmenter is not None:
+            self._unsegmented[result.keyframe_id] = as_jpeg(rgb)
+            for oldest in list(self._unsegmented)[:-MAX_UNSEGMENTED]:
+                del self._unsegmented[oldest]
         has_changed = self._changes != system.remote.changes
         self._changes = system.remote.changes
         if system.dense is not None:
@@ -48,7 +77,9 @@ class Display:
         return has_changed
 
     def map(self, system: LiveSystem, health: Health) -> None:
-        """Show landmarks, keyframes and queues."""
+        """Show landmarks, keyframes, objects and queues."""
+        if system.segmenter is not None:
+            self._show_objects(system)
         cloud, path = system.landmarks(), system.keyframe_trajectory().positions_world
         self._scene.log_points("world/landmarks", cloud.points_world, cloud.colours, 0.008)
         colours = np.full((len(path), 3), 200, np.uint8)
@@ -60,6 +91,17 @@ class Display:
         """Show at most so many parts of the surface that have changed."""
         for region in list(dense.shown.parts)[:at_once]:
             self._scene.log_surface_part(dense.shown.parts.pop(region))
+
+    def _show_objects(self, system: LiveSystem) -> None:
+        """Show the objects as the map told them last, and ask for newer ones now and then."""
+        now_s = time.monotonic()
+        if now_s > self._asked_s + OBJECTS_S:
+            self._asked_s = now_s
+            system.remote.ask_for_objects()
+        found = system.remote.objects
+        if found is not None and found is not self._objects:
+            self._objects = found
+            self._scene.log_boxes(_boxes(found))
 
     def submaps(
         self, dense: RemoteDenseMapper, world: WorldMap, has_changed: bool, at_once: int
@@ -101,3 +143,14 @@ class Display:
         T = world.keyframes[number].T_world_camera
         self._placed[number] = T.copy()
         self._scene.move_submap(number, T)
+
+
+def _boxes(found: MapObjects) -> list[Box]:
+    return [
+        Box(
+            o.box,
+            f"{found.names.map_name(o.label)} {o.distribution[o.label]:.2f}",
+            class_colour(o.label).astype(np.uint8),
+        )
+        for o in found.objects
+    ]

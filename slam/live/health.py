@@ -43,6 +43,9 @@ class Health:
         lost_episodes: how often tracking was lost.
         map_deaths, segmenter_deaths, dense_deaths: how often these processes died or hung and were
             started again.
+        workstation: "connected", "away" while it cannot be reached, "" for none.
+        workstation_losses: how often it was lost.
+        workstation_sent_bytes, workstation_received_bytes: what went there and came from there.
         source: what the source counted, by name.
     """
 
@@ -70,6 +73,10 @@ class Health:
     map_deaths: int = 0
     segmenter_deaths: int = 0
     dense_deaths: int = 0
+    workstation: str = ""
+    workstation_losses: int = 0
+    workstation_sent_bytes: int = 0
+    workstation_received_bytes: int = 0
     source: dict[str, int] = field(default_factory=dict)
 
     def as_json(self) -> str:
@@ -84,6 +91,7 @@ class Health:
         if self.submaps_dropped:
             waiting += f" and {self.submaps_dropped} dropped"
         full = ", DISK FULL" if self.unwritten else ""
+        full += ", WORKSTATION AWAY" if self.workstation == "away" else ""
         return (
             f"{self.status}{full}, {self.frames_per_second:.0f} frames/s, "
             f"{self.latency_ms_median:.0f} ms, {self.keyframes} keyframes, {waiting}, "
@@ -170,5 +178,6 @@ def measure_health(
         map_deaths=remote.worker.crashes,
         segmenter_deaths=segmenter.worker.crashes if segmenter else 0,
         dense_deaths=dense.worker.crashes if dense else 0,
+        **remote.worker.workstation_health(),
         source=asdict(source),
     )

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bmask_slam.graph.arrays import Array, Floats
+from bmask_slam.graph.arrays import Array, Bytes, Floats
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.graph.trajectory import Trajectory
@@ -68,7 +68,8 @@ class LiveMap(SensorInput):
         system = self._system
         owners = {"map": system.remote, "segmenter": system.segmenter, "dense": system.dense}
         last = {} if system.calibration is None else {"calibration": system.calibration.pid}
-        return {name: part.worker.pid for name, part in owners.items() if part is not None} | last
+        pids = {name: part.worker.pid for name, part in owners.items() if part is not None}
+        return {name: pid for name, pid in (pids | last).items() if pid}  # 0: on a workstation
 
     def segment(self) -> int:
         """The number of the largest map segment, which ``map`` and ``trajectory`` are of."""
@@ -88,10 +89,11 @@ class LiveMap(SensorInput):
             self._system.remote.ask_for_objects()
         return self._system.remote.objects
 
-    def on_submap(self, listener: Callable[[int, Floats], None]) -> None:
-        """Call with each submap of the dense map: its keyframe's id, points (N, 3) in its frame.
+    def on_submap(self, listener: Callable[[int, Floats, Bytes], None]) -> None:
+        """Call with each submap of the dense map: its keyframe's id, points (N, 3) and colours.
 
-        Nothing is called without a dense map, or with `LiveOptions.submap_points` 0.
+        The points are in the keyframe's frame. Nothing is called without a dense map, or with
+        `LiveOptions.submap_points` 0.
         """
         dense = self._system.dense
         if dense is not None:

@@ -52,6 +52,7 @@ class LiveSlam(LiveMap):
         source_counts: of the source, for ``health``.
         rows: what metrics.json holds, after ``close``.
         viewer_url: to open in a browser, if the view is served.
+        viewer_addresses: where it can be seen, in words.
         dense: how the dense map ended, after ``close``; None without one.
     """
 
@@ -69,7 +70,7 @@ class LiveSlam(LiveMap):
         self.frames_dropped = 0
         self.source_counts = SourceCounts()
         self.rows: list[Row] = []
-        self.viewer_url = ""
+        self.viewer_url, self.viewer_addresses = "", list[str]()
         self.dense: MapWritten | None = None
         self._counters, self._meter = RunCounters(), FrameMeter()
         self._begin_s = time.monotonic()
@@ -82,6 +83,8 @@ class LiveSlam(LiveMap):
             self._display = self._open_display(stack)
             system = start_system(camera, self.config, self.options, folder)
             self._system = stack.enter_context(closing(system))
+            if self._display is not None:
+                self._display.follow(system)
             self._resources = stack.pop_all()
 
     def __enter__(self) -> LiveSlam:
@@ -104,7 +107,7 @@ class LiveSlam(LiveMap):
             return None
         scene = Scene(self.options.title, self.options.view)
         stack.callback(scene.close)
-        self.viewer_url = scene.url
+        self.viewer_url, self.viewer_addresses = scene.url, scene.addresses
         scene.log_camera(self.camera)
         return Display(scene)
 

@@ -175,6 +175,13 @@ class SaveState:
 
 
 @dataclass(frozen=True)
+class Resent:
+    """To the map's process: messages up to this number had been sent to another one."""
+
+    number: int
+
+
+@dataclass(frozen=True)
 class TellObjects:
     """To the map: send its objects."""
 

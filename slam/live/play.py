@@ -7,10 +7,16 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from pathlib import Path
+from typing import Protocol, TypeAlias
 
+from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.live_slam import LiveSlam, Prepared
+from bmask_slam.live.ros2.outputs import OPTICAL, Robot, Ros2Frames
+from bmask_slam.live.ros2.publisher import Ros2Publisher
+from bmask_slam.live.ros2.services import Ros2Services
+from bmask_slam.live.sources.ros2_source import Ros2Source
 from bmask_slam.live.sources.source import Newest, Source
 from bmask_slam.runtime.progress import make_bar
 from bmask_slam.runtime.stop_request import StopRequest
@@ -24,6 +30,8 @@ AHEAD = 2
 """Number of frames whose features are extracted ahead of tracking if the source waits."""
 KEPT = 3
 """Largest number of frames that wait for tracking otherwise; one more drops all older ones."""
+STOP_S = 1.0
+"""Longest wait for the thread that reads the source, before the source may be played again."""
 WAITING = 1
 """Largest number of keyframes that wait for the map if the source waits.
 
@@ -52,23 +60,39 @@ Listener: TypeAlias = Callable[[FrameResult, LiveSlam], None]
 """Called with each frame's result, in the thread that tracks."""
 
 
+class Service(Protocol):
+    """What is served beside tracking, in the thread that tracks."""
+
+    def serve(self, run: LiveSlam) -> bool:
+        """Do what is to be done; True ends playing. Called often, also where no frame comes."""
+
+
 def play(
-    slam: LiveSlam, source: Source, options: PlayOptions, listener: Listener | None = None
+    slam: LiveSlam,
+    source: Source,
+    options: PlayOptions,
+    listener: Listener | None = None,
+    service: Service | None = None,
 ) -> signal.Signals | None:
     """Track a source's frames; returns the signal that ended it early, if one did.
 
-    Frames that are refused are skipped with a warning.
+    Frames that are refused are skipped with a warning. A ``service`` that ends it is the caller's
+    to ask about; the source may then be played again.
     """
     pairs = _with_features(slam, source)
     with StopRequest() as stop, make_bar(None, options.quiet) as bar:
         chosen = (
             _newest(slam, pairs, options, stop) if options.realtime else prefetched(pairs, AHEAD)
         )
-        for frame, ahead in chosen:
-            prepared = ahead
+        for pair in chosen:
+            if service is not None and service.serve(slam):
+                break
+            if pair is None:
+                continue
+            frame, prepared = pair
             if not options.realtime:  # its latency counts from now: it waited in the queue
                 slam.catch_up(WAITING)
-                prepared = replace(ahead, arrived_s=time.monotonic())
+                prepared = replace(prepared, arrived_s=time.monotonic())
             try:
                 result = _track(slam, source, frame, prepared)
                 if listener is not None:
@@ -98,8 +122,10 @@ def _with_features(slam: LiveSlam, source: Source) -> _Pairs:
         yield frame, slam.prepare(frame.rgb, frame.depth_m)
 
 
-def _newest(slam: LiveSlam, pairs: _Pairs, options: PlayOptions, stop: StopRequest) -> _Pairs:
-    """Frames as they come, without those that tracking has no time for."""
+def _newest(
+    slam: LiveSlam, pairs: _Pairs, options: PlayOptions, stop: StopRequest
+) -> Iterator[tuple[Frame, Prepared] | None]:
+    """Frames as they come, without those that tracking has no time for; None where none comes."""
     newest = Newest(pairs, KEPT)
     heard_s, silent = time.monotonic(), False
     try:
@@ -108,9 +134,31 @@ def _newest(slam: LiveSlam, pairs: _Pairs, options: PlayOptions, stop: StopReque
             slam.frames_dropped = newest.dropped
             if pair is not None:
                 heard_s, silent = time.monotonic(), False
-                yield pair
             elif not silent and time.monotonic() - heard_s > options.silence_s:
                 silent = True
                 logger.warning("no frame for %.0f s; waiting", options.silence_s)
+            yield pair
     finally:
-        newest.stop()
+        newest.stop(STOP_S if stop.signal is None else 0.0)
+
+
+def ros2_ends(source: Ros2Source, params: Path | None) -> tuple[Ros2Publisher, Ros2Services]:
+    """What publishes the results to ROS 2, and what serves its calls.
+
+    Args:
+        params: file with `Ros2Frames`, as YAML.
+    """
+    frames = resolve(Ros2Frames, params)
+    T, by_tf = frames.T_base_camera, False
+    if T is None:
+        T = source.T_base_camera(frames.base)
+        by_tf = T is not None
+    wheels = "odometry" in source.sensors.names
+    robot = Robot(
+        OPTICAL if T is None else T,
+        T is not None,
+        by_tf,
+        source.sensors.T_odom_base if wheels else None,
+        source.ros_time,
+    )
+    return Ros2Publisher(source.node, frames, robot), Ros2Services(source.node, frames.prefix)

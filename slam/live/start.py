@@ -12,7 +12,9 @@ from bmask_slam.graph.calibration.model import SHUTTER, TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.live.network.workstation import Workstation
 from bmask_slam.live.processes.calibration_process import CalibrationSetup
+from bmask_slam.live.processes.map_worker import MapPlace
 from bmask_slam.live.processes.remote_calibration import RemoteCalibration
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.system import LiveSystem
@@ -21,7 +23,7 @@ from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.viewer.scene import ViewOptions
+from bmask_slam.viewer.options import ViewOptions
 
 if TYPE_CHECKING:
     from bmask_slam.dense.growing.frames import FrameOptions
@@ -54,6 +56,7 @@ class LiveOptions:
             found; if not, a bend of depth that is found is not used.
         interpolates: whether it gives depth at the colour image's time by that camera; if not, a
             delay of depth that is found is not used.
+        workstation: another machine, which has the map and makes the masks.
     """
 
     out: Path | None = None
@@ -69,6 +72,7 @@ class LiveOptions:
     calibrate: str = "off"
     straightens: bool = False
     interpolates: bool = False
+    workstation: Workstation | None = None
 
     def __post_init__(self) -> None:
         if self.calibrate not in CALIBRATE:
@@ -128,10 +132,12 @@ def start_system(
     if options.dense and options.out is None:
         raise InputError("a dense map needs a run folder; give one, as out")
     masks: SegmenterOptions = config.semantics.segmenter
+    place = MapPlace(scratch, options.workstation)
     with ExitStack() as undo:
         segmenter, dense, labels = None, None, NoSegmenter.labels
         if masks.name != "none":
-            segmenter = RemoteSegmenter(masks, options.images or Path())
+            about = masks, options.images or Path()
+            segmenter = RemoteSegmenter(*about, workstation=options.workstation)
             undo.callback(segmenter.close)
             labels = segmenter.labels
         if options.dense and options.out is not None:
@@ -141,6 +147,6 @@ def start_system(
         if options.calibrate != "off":
             calibration = start_calibration(camera, config, options)
             undo.callback(calibration.close)
-        system = LiveSystem(camera, config, scratch, segmenter, dense, calibration)
+        system = LiveSystem(camera, config, place, segmenter, dense, calibration)
         undo.pop_all()
         return system

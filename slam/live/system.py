@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,9 +24,11 @@ from bmask_slam.live.messages import (
     CameraEstimated,
     ChangeOwnFactors,
     ImageToSegment,
+    Masks,
     UseCamera,
 )
 from bmask_slam.live.processes.map_process import LabelsOnly
+from bmask_slam.live.processes.map_worker import MapPlace
 from bmask_slam.live.processes.remote_calibration import RemoteCalibration
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
@@ -78,13 +79,15 @@ class LiveSystem(SlamSystem):
         segmenter: the process that makes masks, if any.
         dense: the process that makes submaps, if any.
         calibration: the process that estimates the camera, if any.
+        label_names: the segmenter's classes by number.
+        mask_listeners: called with the masks of each keyframe as they arrive.
     """
 
     def __init__(
         self,
         camera: Camera,
         config: SystemConfig,
-        folder: Path,
+        place: MapPlace,
         segmenter: RemoteSegmenter | None = None,
         dense: RemoteDenseMapper | None = None,
         calibration: RemoteCalibration | None = None,
@@ -93,9 +96,10 @@ class LiveSystem(SlamSystem):
         self._measured: deque[Measurements] = deque()
         self._own_factors = -1
         self._located = 0
-        self._names = (segmenter or NoSegmenter).labels.names
+        self.label_names = (segmenter or NoSegmenter).labels.names
+        self.mask_listeners: list[Callable[[Masks], None]] = []
         with ExitStack() as undo:
-            self.remote = RemoteMapper(camera, config, self._names, folder)
+            self.remote = RemoteMapper(camera, config, self.label_names, place)
             undo.callback(self.remote.close)
             super().__init__(camera, config, back_end=self.remote)
             self.remote.wait_until_ready(RestartPolicy().start_s)
@@ -157,6 +161,8 @@ class LiveSystem(SlamSystem):
             self.moving_objects.observe_masks(masks)
         for found in self.segmenter.receive_masks() if self.segmenter else ():
             self.remote.send(found)
+            for listener in self.mask_listeners:
+                listener(found)
             if self.dense is not None:
                 self.dense.add_masks(found, self.remote.world)
         if self.dense is not None:
@@ -255,7 +261,7 @@ class LiveSystem(SlamSystem):
         state = read_arrays(path, STATE_FILE)[1]
         own = nested(dynamics=self.moving_objects.state())
         whole = SlamSystem(
-            self.camera, self.config, LabelsOnly(self._names, self.config.semantics.segmenter)
+            self.camera, self.config, LabelsOnly(self.label_names, self.config.semantics.segmenter)
         )
         whole.restore({**state, **own}, path)
         self.map, self.camera_tracker = whole.map, whole.camera_tracker

@@ -18,7 +18,10 @@ from bmask_slam.graph.factors.graph_update import (
     FIRST_FRAME,
     FRAMES_OF_A_KIND,
     MARGINAL,
+    MARKERS_OF_A_SEGMENT,
     PosePrior,
+    marker_id,
+    site_id,
 )
 from bmask_slam.graph.files.array_file import part
 from bmask_slam.sensing.reference_frame import RETIRED_FRAME
@@ -69,8 +72,10 @@ class Shift:
         return stamps_s + self.stamp_s
 
     def pose(self, ids: Ints) -> Ints:
-        """Ids of poses in the graph: keyframes, and the reference frames of segments."""
-        return np.where(ids < FIRST_FRAME, ids + self.keyframes, ids + self.segments)
+        """Ids of poses in the graph: keyframes, reference frames and markers of segments."""
+        of_markers = (ids >= marker_id(0, 0)) & (ids < site_id(0))
+        segments = self.segments * np.where(of_markers, MARKERS_OF_A_SEGMENT, 1)
+        return np.where(ids < FIRST_FRAME, ids + self.keyframes, ids + segments)
 
     def after(self, state: Arrays, frames: int, stamp_s: float) -> Shift:
         """The shift of the next run, after one with this shift and state.
@@ -78,9 +83,10 @@ class Shift:
         ``frames`` and ``stamp_s`` are those of the next run.
         """
         frame_ids = state["mapper.graph.keyframe_ids"]
-        frame_ids = frame_ids[frame_ids >= RETIRED_FRAME] % FRAMES_OF_A_KIND
-        retired = frame_ids - RETIRED_FRAME % FRAMES_OF_A_KIND
-        numbers = np.concatenate([state["mapper.world.keyframes.segment"], retired])
+        retired = (frame_ids >= RETIRED_FRAME) & (frame_ids < marker_id(0, 0))
+        frame_ids = frame_ids[retired] % FRAMES_OF_A_KIND
+        past = frame_ids - RETIRED_FRAME % FRAMES_OF_A_KIND
+        numbers = np.concatenate([state["mapper.world.keyframes.segment"], past])
         return Shift(
             self.keyframes + int(state["mapper.world.next_keyframe_id"]),
             self.landmarks + int(state["mapper.world.landmarks.size"]),

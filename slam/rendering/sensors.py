@@ -34,6 +34,8 @@ FORCE_HZ, FORCE_SIGMA_M_S2, FORCE_BIAS_M_S2 = 200.0, 0.05, 0.03
 """Of the accelerometer: rate, white noise of a sample, constant error of each axis."""
 POSITION_S, POSITION_SIGMA_M = 1.0, 0.1
 """Time between positions, and their error: those of ultra-wideband."""
+MARKERS = "markers"
+"""The sensor that is no file, but on the walls."""
 T_ENU_RENDERED = make_pose(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([40.0, -25.0, 8.0]))
 """The frame of positions: not that of the ground truth, with the same way up."""
 
@@ -84,7 +86,7 @@ def imu(T_world_camera: Array, hertz: float, config: ImuConfig, rng: np.random.G
     Rates are those from the pose before to the one after, forces the second differences of the
     IMU's position, so that their integrals lead back to the poses.
     """
-    T = T_world_camera @ T_of(config.imu_in_camera)
+    T = T_world_camera @ config.T_camera_imu
     R, p = T[:, :3, :3], T[:, :3, 3]
     padded = np.concatenate([R[:1], R, R[-1:]])
     rates = so3_log(padded[:-2].mT @ padded[2:]) * hertz / 2
@@ -119,7 +121,7 @@ class SensorsOf(Protocol):
 def write_sensors(folder: Path, wanted: SensorsOf, poses: Array, path: CameraPath) -> None:
     """Write the files of sensors for the poses (N, 4, 4) of a path's frames."""
     config, stamps_s = SensorsConfig(), np.arange(len(poses)) / wanted.fps
-    for number, name in enumerate(wanted.sensors):
+    for number, name in enumerate(name for name in wanted.sensors if name != MARKERS):
         rng = np.random.default_rng([wanted.seed, 23, number])
         if name == "odometry":
             rows = odometry(poses, stamps_s, config.odometry, rng)
@@ -150,5 +152,6 @@ def _text(name: str, rows: Array) -> str:
 def check_sensors(names: tuple[str, ...]) -> None:
     """Raise InputError for a sensor that is not known."""
     for name in names:
-        if name not in COLUMNS:
-            raise InputError(f"sensor {name!r} is unknown; choose of {', '.join(COLUMNS)}")
+        if name not in (*FILES, MARKERS):
+            known = ", ".join((*FILES, MARKERS))
+            raise InputError(f"sensor {name!r} is unknown; choose of {known}")

@@ -30,16 +30,11 @@ from bmask_slam.rendering.engine.path import CameraPath, camera_poses
 from bmask_slam.rendering.engine.raycast import Geometry, Renderer, View, to_image
 from bmask_slam.rendering.engine.scene import Scene, build_scene
 from bmask_slam.rendering.engine.sensor import blur, exposure_gain, measure_depth, optical_flow
+from bmask_slam.rendering.markers import PlacedMarker, add_markers, write_truth
 from bmask_slam.rendering.rooms.random_room import draw_room
-from bmask_slam.rendering.sensors import check_sensors, write_sensors
+from bmask_slam.rendering.sensors import MARKERS, check_sensors, write_sensors
 from bmask_slam.rendering.things.people import Cast, Role, add_people
-from bmask_slam.rendering.writer import (
-    new_folder,
-    stored_depth,
-    write_json,
-    write_lists,
-    write_png,
-)
+from bmask_slam.rendering.writer import new_folder, stored_depth, write_json, write_lists, write_png
 from bmask_slam.sequences.cameras import write_camera
 
 SCENES: dict[str, str] = {
@@ -78,7 +73,8 @@ class RenderConfig:
         width, height: image size in pixels; the field of view stays the Kinect's.
         true_depth: also write the noise-free depth to ``depth_true/``.
         normals: also write camera-frame normals to ``normals/`` as round(127.5 n + 127.5).
-        sensors: also write the files of "odometry", "position", "accelerometer".
+        sensors: also write the files of "odometry", "position", "accelerometer", "imu"; "markers":
+            hang markers on the walls.
     """
 
     name: str
@@ -157,10 +153,9 @@ def _check(config: RenderConfig) -> None:
     if config.name not in SCENES:
         known = f"{', '.join(SCENES)}{did_you_mean(config.name, SCENES)}"
         raise InputError(f"scene {config.name!r} is unknown; choose one of {known}")
-    if config.frames is not None and config.frames < 1:
-        raise InputError(f"frames={config.frames}: must be at least 1")
-    if config.rounds < 1:
-        raise InputError(f"rounds={config.rounds}: must be at least 1")
+    for name in ("frames", "rounds"):
+        if (number := getattr(config, name)) is not None and number < 1:
+            raise InputError(f"{name}={number}: must be at least 1")
     if config.rounds > 1 and config.name not in CLOSED:
         raise InputError(
             f"rounds={config.rounds}: the path of {config.name!r} does not end where it began; "
@@ -212,13 +207,15 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
         )
     poses = poses[: config.frames]
     delay_s = config.depth_delay_ms / 1e3
-    depth_poses = camera_poses(plan.path, config.fps, config.seed, delay_s, config.sweeping)
-    depth_poses = depth_poses[: config.frames]
+    late = camera_poses(plan.path, config.fps, config.seed, delay_s, config.sweeping)
+    depth_poses = late[: config.frames]
     detail = float(np.clip(config.width / 640, 0.25, 1.0))
-    alike = RenderConfig(
-        config.name, None, config.seed, config.people, config.carry, rounds=config.rounds
-    )
-    boxes, cast, scene = _built(alike, detail)
+    alike = RenderConfig(config.name, None, config.seed, config.people, config.carry)
+    hung = tuple(sensor for sensor in config.sensors if sensor == MARKERS)
+    alike = replace(alike, rounds=config.rounds, sensors=hung)
+    boxes, cast, scene, markers = _built(alike, detail)
+    if markers:
+        write_truth(folder, markers)
     write_json(folder / OBJECTS_TRUTH, boxes)
     camera = kinect_camera(config)
     stamps = [f"{i / config.fps:.6f}" for i in range(len(poses))]
@@ -227,10 +224,12 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
 
 
 @lru_cache(maxsize=2)
-def _built(config: RenderConfig, detail: float) -> tuple[dict[str, Any], Cast, Scene]:
-    """The true boxes, the people and the scene; textures have ``detail`` of the full resolution.
+def _built(
+    config: RenderConfig, detail: float
+) -> tuple[dict[str, Any], Cast, Scene, list[PlacedMarker]]:
+    """The true boxes, people, scene and markers; textures have ``detail`` of the full resolution.
 
-    The last two are kept, since a scene is often rendered again at another rate or length. So
+    The last are kept, since a scene is often rendered again at another rate or length. So
     ``config`` may hold only what they depend on.
     """
     plan = _plan(config)
@@ -241,7 +240,9 @@ def _built(config: RenderConfig, detail: float) -> tuple[dict[str, Any], Cast, S
     if config.carry:
         roles = (replace(roles[0], carries="box", pulls=True), *roles[1:])
     cast = add_people(builder, roles[: config.people], plan.lighting, plan.path)
-    return boxes, cast, build_scene(builder, plan.lighting, cast.parts, config.seed)
+    markers = add_markers(builder, plan.path) if config.sensors else []
+    scene = build_scene(builder, plan.lighting, cast.parts, config.seed)
+    return boxes, cast, scene, markers
 
 
 def _draw_all(job: _Job) -> Iterator[list[VisibleInstance]]:

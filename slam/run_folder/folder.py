@@ -25,8 +25,8 @@ recordings.json       of a merged run: its recordings, and what was added to the
 trajectory_run_N.txt  of a merged run: the frames of the Nth run, with its own stamps
 report.html, film.gif after ``bmask-slam report`` and ``film``: a web page, a short film
 health.json           of a live run: rates, delays, queues, what was dropped, every second
-checkpoint            while a run with ``--checkpoint-every`` is not finished: the state from
-                      which ``run --resume`` goes on; removed when the run is complete
+markers.json          with ``--markers``: pose, size and sightings of each fiducial marker
+checkpoint            with ``--checkpoint-every``, until the run ends: ``--resume`` goes on there
 ====================  ============================================================================
 
 ``frames.csv``, ``events.csv`` and ``log.txt`` grow line by line; everything else is written under a
@@ -51,6 +51,7 @@ from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.graph.whole_file import remove, remove_partial, whole_file
 from bmask_slam.run_folder.covariance_file import COVARIANCES
 from bmask_slam.run_folder.frame_file import COLUMNS, FRAMES, frame_row
+from bmask_slam.run_folder.landmark_file import MARKERS
 from bmask_slam.run_folder.open_files import LOG, OpenFiles
 from bmask_slam.run_folder.semantic_files import SEMANTIC_FILES
 from bmask_slam.runtime.memory import is_out_of_memory
@@ -58,24 +59,18 @@ from bmask_slam.sequences.formats.joined import JOINED
 from bmask_slam.tracking.results import FrameResult
 
 FILES = (
-    "config.yaml",
-    "trajectory.txt",
-    "keyframes.txt",
-    FRAMES,
-    EVENTS,
-    "landmarks.ply",
-    "graph",
-    "map",
-    "metrics.json",
-    "trajectory.png",
-    LOG,
+    *("config.yaml", "trajectory.txt", "keyframes.txt", FRAMES, EVENTS, "landmarks.ply"),
+    *("graph", "map", "metrics.json", "trajectory.png", LOG),
 )
 CAMERA, CHECKPOINT = "camera.yaml", "checkpoint"
 SEQUENCE_FILES = ("rgb.txt", "depth.txt", "associations.txt")
 """What is only in a folder that nothing may be removed from."""
 DENSE, HEALTH = "dense", "health.json"
 REPORT, FILM = "report.html", "film.gif"
-SOMETIMES = (CHECKPOINT, CAMERA, COVARIANCES, HEALTH, JOINED, REPORT, FILM, *SEMANTIC_FILES)
+SOMETIMES = (
+    *(CHECKPOINT, CAMERA, COVARIANCES, HEALTH, JOINED, MARKERS, REPORT, FILM),
+    *SEMANTIC_FILES,
+)
 OF_MERGED_RUNS = "trajectory_run_*.txt"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("bmask_slam",)

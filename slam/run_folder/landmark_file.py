@@ -1,4 +1,4 @@
-"""landmarks.ply, written and read back as arrays; dense clouds, read."""
+"""landmarks.ply and markers.json, written and read back as arrays; dense clouds, read."""
 
 from __future__ import annotations
 
@@ -7,15 +7,20 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
 from bmask_slam.graph.arrays import Array, Bytes, Ints
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.json_file import STRICT, format_json, read_json
 from bmask_slam.graph.files.ply import POINTS, check_columns, read_ply, write_ply
 from bmask_slam.graph.files.reading import read_table
+from bmask_slam.graph.sensors.markers import FoundMarker, MarkerMap
 from bmask_slam.labelling.results import LandmarkCloud
 
 LANDMARKS = "landmarks.ply"
+MARKERS = "markers.json"
 LANDMARKS_COMMENT = "bmask-slam landmarks, world frame, metres"
+Row4 = tuple[float, float, float, float]
 
 
 def write_landmarks(path: Path, cloud: LandmarkCloud) -> None:
@@ -134,6 +139,48 @@ def read_dense_cloud(path: Path, names: tuple[str, ...]) -> DenseCloud:
         columns["probability"].astype(float),
         columns["sigma"].astype(float),
     )
+
+
+class _SavedMarker(BaseModel):
+    """A marker in markers.json."""
+
+    model_config = STRICT
+    id: int
+    size_m: float | None
+    T_world_marker: tuple[Row4, Row4, Row4, Row4]
+    seen: int
+    used: int
+
+
+class _SavedMarkers(BaseModel):
+    """The content of markers.json."""
+
+    model_config = STRICT
+    dictionary: str
+    T_world_site: tuple[Row4, Row4, Row4, Row4] | None
+    markers: list[_SavedMarker]
+
+
+def write_markers(path: Path, found: MarkerMap) -> None:
+    """Write markers.json; poses are rows of (4, 4), in metres."""
+    path.write_text(format_json(found) + "\n", encoding="utf-8")
+
+
+def read_markers(path: Path) -> MarkerMap:
+    """Read what `write_markers` wrote. Raises InputError."""
+    saved = read_json(path, _SavedMarkers, "run again with --markers")
+    markers = [
+        FoundMarker(
+            m.id,
+            np.nan if m.size_m is None else m.size_m,
+            np.array(m.T_world_marker),
+            m.seen,
+            m.used,
+        )
+        for m in saved.markers
+    ]
+    T_world_site = None if saved.T_world_site is None else np.array(saved.T_world_site)
+    return MarkerMap(saved.dictionary, T_world_site, tuple(markers))
 
 
 def _columns(

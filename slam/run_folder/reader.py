@@ -17,6 +17,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.json_file import STRICT, read_json
 from bmask_slam.graph.files.reading import read_text
+from bmask_slam.graph.sensors.markers import MarkerMap
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices, read_tum
 from bmask_slam.run_folder.covariance_file import COVARIANCES, read_covariances
 from bmask_slam.run_folder.folder import CHECKPOINT, DENSE, FILES, trajectory_files
@@ -28,10 +29,12 @@ from bmask_slam.run_folder.frame_file import (
 )
 from bmask_slam.run_folder.landmark_file import (
     LANDMARKS,
+    MARKERS,
     DenseCloud,
     Landmarks,
     read_dense_cloud,
     read_landmarks,
+    read_markers,
 )
 from bmask_slam.run_folder.origin import CONFIG, read_origin
 from bmask_slam.run_folder.semantic_files import OBJECTS, SavedObject, read_objects
@@ -149,6 +152,11 @@ class Run:
         return read_landmarks(self._file(LANDMARKS), names)
 
     @cached_property
+    def markers(self) -> MarkerMap:
+        """The fiducial markers of the largest map segment."""
+        return read_markers(self._file(MARKERS, "--markers DICT:SIZE_M"))
+
+    @cached_property
     def objects(self) -> tuple[SavedObject, ...]:
         """The objects of the largest map segment."""
         return tuple(self._label_names_and_objects[1])
@@ -191,8 +199,7 @@ class Run:
     def landmark_covariances(self) -> Array:
         """Covariances (N, 3, 3) of the ``landmarks`` in m^2, world axes; computed from the graph.
 
-        NaN for a landmark that is not in the graph at the end of the run. The computation takes
-        from less than a second to a minute.
+        NaN for a landmark that is not in the graph at the end. It takes up to a minute.
         """
         ids, covariances = self._marginals(self.landmarks.ids)[1]
         return _rows_of(self.landmarks.ids, ids, covariances)

@@ -42,12 +42,16 @@ class _Link:
 def inertial_update(
     keyframes: Sequence[Keyframe], tables: InertialTables, streams: SensorStreams, config: ImuConfig
 ) -> InertialUpdate:
-    """The factors that can be made now between the keyframes of one segment, in their order."""
+    """The factors that can be made now between the keyframes of one segment, in their order.
+
+    Those of another mounting are made anew.
+    """
     if not config.enabled or not len(streams.of("imu")):
         return InertialUpdate()
     links = []
     for a, b in pairwise(keyframes):
-        known = (a.id, b.id) in tables.factors
+        factor, model = tables.factors.get((a.id, b.id)), config.model
+        known = factor is not None and np.array_equal(factor.model.numbers, model.numbers)
         if not known and b.timestamp_s - a.timestamp_s <= config.max_apart_s:
             readings = readings_between(streams, a.timestamp_s, b.timestamp_s, config)
             if readings is not None:
@@ -100,8 +104,11 @@ def _restarts(
     return found
 
 
-def newest_state(world: WorldMap, tables: FactorTables) -> InertialState | None:
-    """What the graph knows of the motion at the newest keyframe that an IMU led to."""
+def newest_state(world: WorldMap, tables: FactorTables, mounting: Array) -> InertialState | None:
+    """What the graph knows of the motion at the newest keyframe that an IMU led to.
+
+    ``mounting`` (8,) and the delay, where they were estimated; else empty.
+    """
     inertial = tables.inertial
     known = [k for k in inertial.states if k in world.keyframes]
     if not known:
@@ -111,7 +118,8 @@ def newest_state(world: WorldMap, tables: FactorTables) -> InertialState | None:
     if down is None:
         return None
     R = keyframe.T_world_camera[:3, :3].T
-    return InertialState(keyframe.id, keyframe.timestamp_s, R @ state[:3], R @ down, state[3:])
+    motion = R @ state[:3], R @ down, state[3:]
+    return InertialState(keyframe.id, keyframe.timestamp_s, *motion, mounting)
 
 
 def motion_by_imu(

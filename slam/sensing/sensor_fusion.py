@@ -7,8 +7,7 @@ the measurements. A keyframe that is culled leaves a gap that the next update cl
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import Protocol
 
@@ -21,15 +20,13 @@ from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import (
     ANCHOR,
     FIRST_FRAME,
-    FRAMES_OF_A_KIND,
     GRAVITY,
+    MARKER,
     ODOMETRY,
     PLANAR,
     POSITION,
-    PosePrior,
+    SITE,
     RelativePose,
-    RelativePoseName,
-    plane_id,
 )
 from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.files.array_file import nested, part
@@ -37,19 +34,18 @@ from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.inertial.tables import InertialState
 from bmask_slam.graph.sensors.accelerometer import Plumb
 from bmask_slam.graph.sensors.config import SensorsConfig
+from bmask_slam.graph.sensors.markers import MarkerMap
 from bmask_slam.graph.sensors.odometry import Motion, motion_between
-from bmask_slam.graph.sensors.streams import COLUMNS, Measurements, SensorStreams
+from bmask_slam.graph.sensors.streams import Measurements, SensorStreams
 from bmask_slam.graph.smoother.smoother import Smoother
+from bmask_slam.loops.closing import LoopCloser
+from bmask_slam.sensing.carried_frames import carried_frames, example_state, is_known
+from bmask_slam.sensing.imu_estimation import MountingEstimator, with_mounting
 from bmask_slam.sensing.inertial_fusion import carried, inertial_update, motion_by_imu, newest_state
+from bmask_slam.sensing.marker_fusion import MarkerFusion
+from bmask_slam.sensing.marker_sightings import WORDS, MarkerSight, Sighting, Verdict
 from bmask_slam.sensing.planar_motion import planar_changes
-from bmask_slam.sensing.reference_frame import (
-    RETIRED_FRAME,
-    SIGMA_M,
-    SIGMA_RAD,
-    Made,
-    ReferenceFrame,
-    SensorChanges,
-)
+from bmask_slam.sensing.reference_frame import Made, ReferenceFrame, SensorChanges
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
@@ -57,18 +53,19 @@ MIN_SHARED = 15
 """A new keyframe that shares fewer landmarks with the one before is held to it weakly ..."""
 WEAK_COVARIANCE = diagonal_covariance(0.05, 0.1)
 """... as a keyframe that a removal left underconstrained."""
-DEGREES = {ODOMETRY: 6, GRAVITY: 2, POSITION: 3, PLANAR: 3}
+DEGREES = {ODOMETRY: 6, GRAVITY: 2, POSITION: 3, PLANAR: 3, MARKER: 6, SITE: 6}
 """The kinds of factors, and the degrees of freedom of their errors."""
 KINDS = tuple(DEGREES)
 FIT_PROBABILITY = 0.9999
 
 
 class GraphOwner(Protocol):
-    """Has a map, the frames, and the graph."""
+    """Has a map, the frames, the graph, and its loops."""
 
     world: WorldMap
     history: FrameHistory
     smoother: Smoother
+    loops: LoopCloser
 
 
 class SensorFusion:
@@ -79,6 +76,8 @@ class SensorFusion:
         streams: their measurements.
         refused: by sensor, how many measurements came too late.
         newest: how the camera moved at the newest keyframe, with an IMU.
+        markers: makes the factors of markers.
+        imu: finds how the IMU is mounted.
     """
 
     def __init__(self, config: SensorsConfig, events: EventLog) -> None:
@@ -89,6 +88,8 @@ class SensorFusion:
         self._made: Made = {}
         self._plumbs: dict[int, Plumb] = {}
         self.newest: InertialState | None = None
+        self.markers = MarkerFusion(config.markers, events)
+        self.imu = MountingEstimator(config.imu, events)
         self._first_keyframe = 0  # of this session
 
     def add(self, new: Measurements, world: WorldMap) -> None:
@@ -120,7 +121,9 @@ class SensorFusion:
         if end_s - begin_s <= config.max_blackout_s:
             moved = motion_between(self.streams, begin_s, end_s, config, config.max_gap_s)
         if moved is None and self.newest is not None:
-            moved = motion_by_imu(self.streams, self.newest, begin_s, end_s, self.config.imu)
+            imu, mounting = self.config.imu, self.newest.mounting
+            imu = with_mounting(imu, mounting) if len(mounting) else imu
+            moved = motion_by_imu(self.streams, self.newest, begin_s, end_s, imu)
         return moved
 
     def carry_over(self, old: FactorTables, new: FactorTables, world: WorldMap) -> SensorChanges:
@@ -133,9 +136,10 @@ class SensorFusion:
         kept = [
             factor
             for kind in KINDS
+            if kind != SITE  # the configuration has them
             for factor in old.relative_poses(kind)
             if all(k >= FIRST_FRAME or k < self._first_keyframe for k in factor.keyframe_ids)
-            and _is_known(factor.name, world)
+            and is_known(factor.name, world)
         ]
         found = carried_frames(kept, old, world)
         self._made = {factor.name: np.nan for factor in found.relative_poses}
@@ -147,6 +151,7 @@ class SensorFusion:
         Its measurements replace the present ones and are of its keyframes only; factors stay.
         """
         self.streams, self.refused, self.newest = SensorStreams(), {}, None
+        self.imu.begin_session()
         self._first_keyframe = first_keyframe
         self._made = dict.fromkeys(self._made, np.nan)  # stamps are of the other recording
 
@@ -156,7 +161,7 @@ class SensorFusion:
             return SensorChanges()
         world, history, tables = owner.world, owner.history, owner.smoother.tables
         self._forget_culled(world)
-        found = SensorChanges()
+        found, sight = SensorChanges(), MarkerSight(world, tables, owner.loops.noise, self._made)
         for segment in sorted({k.segment for k in world.keyframes.values()}):
             given = self.streams, self.config, self._made, self._plumbs, self._first_keyframe
             frame = ReferenceFrame(segment, world, history, tables, *given, last)
@@ -164,12 +169,16 @@ class SensorFusion:
             moved = SensorChanges(relative_poses=tuple(self._odometry(present)))
             found = found.with_more(moved).with_more(frame.changes())
             found = found.with_more(self._inertial(present, tables))
+            found = found.with_more(self.markers.changes(present, sight, self.streams))
             found = found.with_more(planar_changes(present, tables, self._made, self.config.planar))
         return found
 
     def _inertial(self, keyframes: list[Keyframe], tables: FactorTables) -> SensorChanges:
         """Factors of an IMU; a new keyframe that shares too little is held weakly beside them."""
-        update = inertial_update(keyframes, tables.inertial, self.streams, self.config.imu)
+        self.imu.update(keyframes, self.streams)
+        if (config := self.imu.config) is None:
+            return SensorChanges()
+        update = inertial_update(keyframes, tables.inertial, self.streams, config)
         weak = []
         by_id = {k.id: k for k in keyframes}
         for factor in update.factors:
@@ -183,7 +192,7 @@ class SensorFusion:
     def follow(self, owner: GraphOwner) -> None:
         """The graph was optimised: keep how the camera moves, for a blackout."""
         if self.streams or owner.smoother.tables.inertial:
-            self.newest = newest_state(owner.world, owner.smoother.tables)
+            self.newest = newest_state(owner.world, owner.smoother.tables, self.imu.found)
 
     def _odometry(self, keyframes: list[Keyframe]) -> Iterator[RelativePose]:
         """Motion between keyframes in a row."""
@@ -199,13 +208,35 @@ class SensorFusion:
                 yield RelativePose(a.id, b.id, motion.T_a_b, motion.covariance, robust, ODOMETRY)
 
     def _forget_culled(self, world: WorldMap) -> None:
-        for name in [name for name in self._made if not _is_known(name, world)]:
+        for name in [name for name in self._made if not is_known(name, world)]:
             del self._made[name]
         for keyframe_id in [i for i in self._plumbs if i not in world.keyframes]:
             del self._plumbs[keyframe_id]
 
+    def keep_verdict(self, found: Sighting, moved: bool) -> None:
+        """Keep what became of a marker's sighting that waited: a factor, or refused."""
+        if moved:
+            self.markers.tell_moved(found, self._made)
+        self._made[found.factor.name] = float(Verdict.MOVED) if moved else np.nan
+
+    def marker_map(self, tables: FactorTables, segment: int) -> MarkerMap:
+        """The markers of a map segment."""
+        return self.markers.map(tables, segment, self.sightings())
+
+    def sightings(self) -> dict[int, dict[str, int]]:
+        """By marker's id in the graph: how many sightings were "used", and refused for a reason."""
+        found: dict[int, dict[str, int]] = {}
+        for (marker, _, kind), value in self._made.items():
+            if kind == MARKER:
+                what = "used" if np.isnan(value) else WORDS[Verdict(int(value))]
+                counts = found.setdefault(marker, {})
+                counts[what] = counts.get(what, 0) + 1
+        return found
+
     def report(self, smoother: Smoother) -> None:
         """Tell how many factors of each kind do not fit the final estimate."""
+        self.markers.report(self.sightings())
+        self.imu.report(self.streams)
         for kind in KINDS if self._made else ():
             found = smoother.relative_pose_errors(kind)
             wrong = found.chi2 > chi2_quantile(FIT_PROBABILITY, DEGREES[kind])
@@ -224,6 +255,8 @@ class SensorFusion:
         ids = [(KINDS.index(kind), a, b) for a, b, kind in self._made]
         return {
             **nested(streams=self.streams.state()),
+            **self.markers.state(),
+            **self.imu.state(),
             "first_keyframe": np.array(self._first_keyframe),
             "made": np.array(ids, np.int64).reshape(-1, 3),
             "made_s": np.array(list(self._made.values()), float),
@@ -239,6 +272,8 @@ class SensorFusion:
         self.streams = SensorStreams()
         state = {**{n: a for n, a in example_state().items() if "." not in n}, **state}
         self.streams.restore(part(state, "streams"))
+        self.markers.restore(state)
+        self.imu.restore(state)
         self._first_keyframe = int(state["first_keyframe"])
         self.newest = InertialState.of(state["newest"]) if len(state["newest"]) else None
         made = zip(state["made"].tolist(), state["made_s"].tolist(), strict=True)
@@ -247,46 +282,3 @@ class SensorFusion:
         self._plumbs = {
             i: Plumb(row[:3], row[3:12].reshape(3, 3), float(row[12])) for i, row in plumbs
         }
-
-
-def carried_frames(
-    factors: Sequence[RelativePose], old: FactorTables, world: WorldMap
-) -> SensorChanges:
-    """Factors of another graph for a new one, with reference frames where their keyframes are now.
-
-    A frame whose segment is no more gets an id that no segment has.
-    """
-    segments = {k.segment for k in world.keyframes.values()}
-    keyframe_of = {f.keyframe_a: f.keyframe_b for f in factors if f.keyframe_a >= FIRST_FRAME}
-    planes = plane_id(0)
-    free = max([RETIRED_FRAME, *(i + 1 for i in keyframe_of if i < planes)])
-    ids, poses = {}, []
-    for frame, keyframe in sorted(keyframe_of.items()):
-        segment = (frame - FIRST_FRAME) % FRAMES_OF_A_KIND
-        stays = segment in segments or RETIRED_FRAME <= frame < planes
-        ids[frame] = frame if stays else free
-        free += not stays
-        T_old, T_frame = old.keyframes.get(np.array([keyframe, frame]))
-        poses.append(world.keyframes[keyframe].T_world_camera @ inverse(T_old) @ T_frame)
-    covariance = diagonal_covariance(SIGMA_RAD, SIGMA_M)
-    pairs = zip(ids.values(), poses, strict=True)
-    return SensorChanges(
-        np.array(list(ids.values()), np.int64),
-        np.array(poses).reshape(-1, 4, 4),
-        tuple(PosePrior(i, T, covariance) for i, T in pairs),
-        tuple(replace(f, keyframe_a=ids.get(f.keyframe_a, f.keyframe_a)) for f in factors),
-    )
-
-
-def example_state() -> Arrays:
-    """The arrays that a state has when there are measurements of all sensors, without rows."""
-    rows = {sensor: np.zeros((0, len(names))) for sensor, names in COLUMNS.items()}
-    made: Arrays = {"made": np.zeros((0, 3), np.int64), "made_s": np.zeros(0)}
-    plumbs: Arrays = {"plumb_ids": np.zeros(0, np.int64), "plumbs": np.zeros((0, 13))}
-    first: Arrays = {"first_keyframe": np.array(0), "newest": np.zeros(0)}
-    return {**nested(streams=rows), **first, **made, **plumbs}
-
-
-def _is_known(name: RelativePoseName, world: WorldMap) -> bool:
-    """Whether the keyframes of a factor are in the map."""
-    return all(k >= FIRST_FRAME or k in world.keyframes for k in name[:2])

@@ -2,51 +2,117 @@
 
 from __future__ import annotations
 
+import logging
+import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.events import EVENTS, Event, read_events
 from bmask_slam.graph.arrays import Array, Arrays, Bytes
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.graph_update import RelativePose
 from bmask_slam.graph.files.ply import POINTS, read_ply
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices
-from bmask_slam.run_folder.frame_file import FRAMES, FrameTable, read_frames
+from bmask_slam.run_folder.frame_file import FRAMES, MAX_STAMP_ERROR_S, FrameTable, read_frames
 from bmask_slam.run_folder.map_file import SavedRun, read_run
+from bmask_slam.run_folder.reader import Run
 from bmask_slam.run_folder.semantic_files import OBJECTS, read_objects
 from bmask_slam.semantics.instances.overlay import class_colour
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
-from bmask_slam.viewer.scene import Box, Scene
+from bmask_slam.viewer.replay_pictures import ReplayPictures
+from bmask_slam.viewer.scene import PATH_COLOUR, Scene
+from bmask_slam.viewer.shown import Box, Ellipsoid
+
+logger = logging.getLogger(__name__)
 
 MAX_DENSE_POINTS = 300_000
-MAX_STAMP_ERROR_S = 1e-5
 
 
-def replay(path: Path, scene: Scene) -> int:
+@dataclass(frozen=True)
+class ReplayOptions:
+    """How a finished run is shown.
+
+    Attributes:
+        sequence: its images; None: where they were.
+        images: whether they are shown, and masks of keyframes with them.
+        paced: at the rate of the stamps, for a viewer that is connected.
+    """
+
+    sequence: Path | None = None
+    images: bool = True
+    paced: bool = False
+
+
+def replay(path: Path, scene: Scene, options: ReplayOptions | None = None) -> int:
     """Show a run folder; returns the number of its frames.
 
     Raises:
         InputError: a file of it is missing or broken.
     """
-    run = read_run(path)
+    options, run = options or ReplayOptions(), read_run(path)
     scene.log_camera(run.camera)
     trajectory = run.trajectories["trajectory.txt"]
+    table = read_frames(path / FRAMES)
     scene.set_time(float(trajectory.timestamps_s[0]) if len(trajectory) else 0.0)
+    pictures = ReplayPictures(path, options.sequence, table) if options.images else None
+    scene.log_names(pictures.names if pictures else ())
     _show_map(run, scene)
     try:
-        frames = _frame_results(read_frames(path / FRAMES), trajectory)
+        frames = _frame_results(table, trajectory, _events(path))
     except ValueError as error:  # of TrackingStatus
         raise InputError(f"{path / FRAMES}: {error}; run again") from error
-    for frame in frames:
+    uncertain = _show_uncertainty(path, scene)
+    began_s = time.monotonic()
+    for line, frame in enumerate(frames):
+        if options.paced:
+            due_s = began_s + frame.timestamp_s - frames[0].timestamp_s
+            time.sleep(max(due_s - time.monotonic(), 0.0))
         scene.log_frame(frame)
-    scene.log_line("world/trajectory", trajectory.positions_world, (80, 170, 255))
+        covariance = uncertain.get(int(table.keyframe_ids[line]))
+        if covariance is not None:
+            scene.log_uncertainty(covariance)
+        if pictures is not None:
+            pictures.show(line, frame.timestamp_s, scene)
+    scene.log_line("world/trajectory", trajectory.positions_world, PATH_COLOUR)
     return len(frames)
+
+
+def _events(run: Path) -> dict[int, list[Event]]:
+    """What happened, by frame; a run of an older version has no such file."""
+    found: dict[int, list[Event]] = {}
+    for event in read_events(run / EVENTS) if (run / EVENTS).is_file() else ():
+        found.setdefault(event.frame, []).append(event)
+    return found
+
+
+def _show_uncertainty(path: Path, scene: Scene) -> dict[int, Array]:
+    """Show where the keyframes may be; their covariances (6, 6) [rad, m] by id.
+
+    By covariances.txt, else by the graph, which takes a second in a long run.
+    """
+    run = Run(path)
+    try:
+        keyframes, covariances = run.keyframes, run.keyframe_covariances
+    except (InputError, RuntimeError) as error:  # RuntimeError: GTSAM's, of a singular graph
+        logger.warning("shown without uncertainty: %s", error)
+        return {}
+    known = np.flatnonzero(np.isfinite(covariances).all(axis=(1, 2)))
+    R = keyframes.poses_world_camera[known, :3, :3]
+    position = R @ covariances[known, 3:, 3:] @ np.swapaxes(R, 1, 2)
+    centres = keyframes.poses_world_camera[known, :3, 3]
+    shown = [Ellipsoid.of(c, m) for c, m in zip(centres, position, strict=True)]
+    scene.log_ellipsoids("world/uncertainty", shown)
+    return dict(zip(keyframes.ids[known].tolist(), covariances[known], strict=True))
 
 
 def _show_map(run: SavedRun, scene: Scene) -> None:
     """Show landmarks, keyframes, loops, objects and the dense cloud."""
     landmarks = run.landmarks
-    scene.log_points("world/landmarks", _xyz(landmarks), landmark_colours(landmarks), 0.008)
+    labels = landmarks.get("label")
+    places, colours = _xyz(landmarks), landmark_colours(landmarks)
+    scene.log_points("world/landmarks", places, colours, 0.008, labels)
     keyframes = run.keyframes.positions_world
     grey = np.full((len(keyframes), 3), 200, np.uint8)
     scene.log_points("world/keyframes", keyframes, grey, 0.02)
@@ -99,7 +165,9 @@ def _boxes(run: Path) -> list[Box]:
     ]
 
 
-def _frame_results(frames: FrameTable, trajectory: Trajectory) -> list[FrameResult]:
+def _frame_results(
+    frames: FrameTable, trajectory: Trajectory, events: dict[int, list[Event]]
+) -> list[FrameResult]:
     """The frames of a run with their final poses."""
     near = known = np.zeros(len(frames), int)
     if len(trajectory):
@@ -115,6 +183,7 @@ def _frame_results(frames: FrameTable, trajectory: Trajectory) -> list[FrameResu
             inliers=int(frames.inliers[k]),
             ignored=int(frames.ignored[k]),
             stage_ms={n: float(ms[k]) for n, ms in frames.stage_ms.items() if np.isfinite(ms[k])},
+            events=tuple(events.get(int(frames.index[k]), ())),
         )
         for k in range(len(frames))
     ]

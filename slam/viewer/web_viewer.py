@@ -16,10 +16,10 @@ from types import ModuleType
 from urllib.parse import quote
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.viewer.options import LOCAL
 
 logger = logging.getLogger(__name__)
 
-LOCAL = "127.0.0.1"
 START_S = 20.0
 _START = (
     "import ctypes, os, sys; sys.platform == 'linux' and ctypes.CDLL(None).prctl(1, 15); "

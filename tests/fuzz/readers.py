@@ -60,8 +60,8 @@ from bmask_slam.graph.trajectory_formats import (
     write_euroc,
     write_kitti,
 )
-from bmask_slam.live.ros2.dds import decoded, typestore
 from bmask_slam.live.ros2.sensors import ImageClock, Ros2Sensors
+from bmask_slam.live.ros2.transport import decoded, typestore
 from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
 from bmask_slam.mapping.inverse_depth.depth_map import DEPTH_FILE, read_depth_map
@@ -70,7 +70,7 @@ from bmask_slam.offline.checkpoint import CHECKPOINT_FILE, read_checkpoint
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.run_folder.covariance_file import read_covariances
 from bmask_slam.run_folder.frame_file import read_frames
-from bmask_slam.run_folder.landmark_file import read_dense_cloud, read_landmarks
+from bmask_slam.run_folder.landmark_file import read_dense_cloud, read_landmarks, read_markers
 from bmask_slam.run_folder.map_file import MAP_FILE, read_map
 from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.run_folder.reader import Run
@@ -171,6 +171,14 @@ def objects() -> bytes:
         "keyframes": [0, 2], "landmarks": [1, 5], "first_seen_s": 0.0, "last_seen_s": 1.0,
     }  # fmt: skip
     return json.dumps({"labels": ["unknown", "cup"], "objects": [row]}).encode()
+
+
+def markers() -> bytes:
+    pose = np.eye(4).tolist()
+    row = {"id": 3, "size_m": 0.2, "T_world_marker": pose, "seen": 4, "used": 3}
+    return json.dumps(
+        {"dictionary": "4X4_50", "T_world_site": pose, "markers": [row, row | {"size_m": None}]}
+    ).encode()
 
 
 def images() -> tuple[bytes, ...]:
@@ -740,6 +748,7 @@ def document_readers(folder: Path) -> list[Reader]:
         Reader("experiment", "e.yaml", read_experiment, (experiment,), yaml_maker),
         of_json("COCO", "annotations.json", read_masks, coco()),
         of_json("objects.json", "objects.json", in_folder(read_objects), objects()),
+        of_json("markers.json", "markers.json", read_markers, markers()),
         of_json("metrics.json", "metrics.json", in_folder(lambda p: Run(p).metrics), metrics),
         of_json("results.json", "results.json", read_results, results),
         of_json("recordings.json", "recordings.json", read_first, joined),

@@ -23,6 +23,11 @@ FLAGS = (
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
     "--disable-dev-shm-usage", "--hide-scrollbars", "--remote-debugging-pipe",
 )  # fmt: skip
+DRAWING = (
+    *(flag for flag in FLAGS if flag != "--disable-gpu"),
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
+)
+"""Of a browser that draws by WebGL, in software."""
 TIMEOUT_S = 240.0
 ON_3_AND_4 = """
 import fcntl, os, sys
@@ -62,12 +67,20 @@ class Browser:
 
     def open(self, page: Path, width_px: int, media: str = "screen", scheme: str = "light") -> None:
         """Load a file completely in a window of this width."""
+        self.go(page.resolve().as_uri(), width_px, media=media, scheme=scheme)
+
+    def go(
+        self, url: str, width_px: int, height_px: int = 740, media: str = "screen",
+        scheme: str = "light",
+    ) -> None:  # fmt: skip
+        """Load an address completely in a window of this size."""
         self.events.clear()
-        size = {"width": width_px, "height": 740, "deviceScaleFactor": 1, "mobile": width_px < 600}
+        size = {"width": width_px, "height": height_px, "deviceScaleFactor": 1}
+        size["mobile"] = width_px < 600
         self.call("Emulation.setDeviceMetricsOverride", **size)
         features = [{"name": "prefers-color-scheme", "value": scheme}]
         self.call("Emulation.setEmulatedMedia", media=media, features=features)
-        self.call("Page.navigate", url=page.resolve().as_uri())
+        self.call("Page.navigate", url=url)
         while not any(e.get("method") == "Page.loadEventFired" for e in self.events):
             self.events.append(self._next())
 
@@ -107,11 +120,11 @@ class Browser:
 
 
 @contextmanager
-def chromium(profile: Path) -> Iterator[Browser]:
+def chromium(profile: Path, flags: tuple[str, ...] = FLAGS) -> Iterator[Browser]:
     """A browser with an empty profile in the folder."""
     assert EXECUTABLE
     (reads, to_browser), (from_browser, writes) = os.pipe(), os.pipe()
-    command = [sys.executable, "-c", ON_3_AND_4, str(reads), str(writes), EXECUTABLE, *FLAGS]
+    command = [sys.executable, "-c", ON_3_AND_4, str(reads), str(writes), EXECUTABLE, *flags]
     process = subprocess.Popen(
         [*command, f"--user-data-dir={profile}", "about:blank"],
         pass_fds=(reads, writes),

@@ -1,7 +1,8 @@
 """A second process on a DDS domain: plays a moving camera before a plane, and keeps what it hears.
 
-Arguments: domain, rate in Hz, file for the received messages (JSON). Frames that are dropped do not
-matter: the camera goes to and fro until standard input is closed.
+Arguments: domain, rate in Hz, file for the received messages (JSON), and services to call, each
+after the answer of the one before. Frames that are dropped do not matter: the camera goes to and
+fro until standard input is closed.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ import numpy as np
 from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.graph.geometry import inverse, make_pose, rotation_from_quaternion, se3_exp
-from bmask_slam.live.ros2.dds import LATCHED, SENSOR, STATE, Node, idl_struct
-from bmask_slam.live.ros2.messages import header, message, transform, type_name, typestore
+from bmask_slam.live.ros2.dds import DdsNode, idl_struct
+from bmask_slam.live.ros2.messages import header, message, transform, type_name
 from bmask_slam.live.ros2.messages import pose as ros_pose
+from bmask_slam.live.ros2.transport import LATCHED, SENSOR, STATE, typestore
 
 COLOUR, DEPTH = "/camera/camera/color/image_raw", "/camera/camera/aligned_depth_to_color/image_raw"
 INFO, WHEELS = "/camera/camera/color/camera_info", "/odom"
@@ -106,10 +108,41 @@ def _value(kind: Any, rng: np.random.Generator, as_idl: bool) -> Any:
     return np.array(values, described[0][1][0])
 
 
+class Caller:
+    """Calls services of bmask-slam one after the other; ``answers`` are as they came."""
+
+    def __init__(self, node: DdsNode, calls: list[str]) -> None:
+        self.answers: list[dict] = []
+        self._calls = [call.split("=") for call in calls]
+        kinds = {name: "SetBool" if value else "Trigger" for name, *value in self._calls}
+        self._clients = {
+            name: (node.service(f"/bmask_slam/{name}", f"std_srvs/srv/{kind}", calls=True), kind)
+            for name, kind in kinds.items()
+        }
+        self._waits = False
+
+    def step(self, frame: int) -> None:
+        """Call the next, or take an answer."""
+        if self._waits:
+            name = self._calls[0][0]
+            for answer in self._clients[name][0].take():
+                message, self._waits = answer.message, False
+                told = {"success": message.success, "text": message.message, "frame": frame}
+                self.answers.append({"name": name} | told)
+            if not self._waits:
+                self._calls.pop(0)
+        elif self._calls:
+            name, *value = self._calls[0]
+            client, kind = self._clients[name]
+            request = typestore().types[f"std_srvs/srv/{kind}_Request"]
+            client.send(request(bool(value and value[0] == "on")), bytes(range(16)))
+            self._waits = True
+
+
 def main() -> None:
     """Play frames until standard input is closed."""
     domain, rate_hz, out = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
-    node = Node(domain)
+    node = DdsNode(domain)
     image_type = "sensor_msgs/msg/Image"
     colours = node.writer(COLOUR, image_type, SENSOR._replace(reliable=True))
     depths = node.writer(DEPTH, image_type, SENSOR._replace(reliable=True))
@@ -121,6 +154,7 @@ def main() -> None:
     readers = {t: node.reader(t, type_name(k), q) for t, (k, q) in HEARD.items()}
     heard: dict[str, list] = {topic: [] for topic in HEARD}
     rendered = [render_plane(pose(k), k) for k in range(PLACES)]
+    caller = Caller(node, sys.argv[4:])
     k, end_s, ends = 0, time.monotonic() + LONGEST_S, False
     while not ends and time.monotonic() < end_s:
         ends = bool(select.select([sys.stdin], [], [], 0)[0])  # what came until then is read
@@ -132,9 +166,11 @@ def main() -> None:
         odometry.send(wheels(k))
         colours.send(image(stamp_s, "rgb8", frame.rgb))
         depths.send(image(stamp_s, "32FC1", frame.depth_m.astype(np.float32)))
+        if heard["/bmask_slam/odometry"]:
+            caller.step(k)
         k += bool(heard["/bmask_slam/odometry"])  # the first is repeated until somebody tracks
         time.sleep(1 / rate_hz)
-    Path(out).write_text(json.dumps(heard))
+    Path(out).write_text(json.dumps(heard | {"answers": caller.answers}))
 
 
 def told(received: object) -> dict:

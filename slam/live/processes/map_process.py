@@ -39,6 +39,7 @@ from bmask_slam.live.messages import (
     PruneLandmarks,
     PruneMask,
     Ready,
+    Resent,
     RestoreObservations,
     SaveMap,
     SaveState,
@@ -92,13 +93,8 @@ def serve_map(
         header, saved = read_arrays(state, STATE_FILE)
         camera = read_camera(header, state)
     system = SlamSystem(camera, config, segmenter)
-    system.semantics = SemanticMapper(
-        camera,
-        config.semantics,
-        system.map,
-        segmenter,
-        on_masks=channel.send,  # to tracking's side, where it is known what moves
-    )
+    about = camera, config.semantics, system.map, segmenter
+    system.semantics = SemanticMapper(*about, on_masks=channel.send)  # what moves: tracking knows
     system.events.on_event = channel.send
     if state is not None and saved is not None:
         system.restore(saved, state)
@@ -139,6 +135,8 @@ class MapServer:
                 self.take_from_user(message)
             case SaveState():
                 self.save(number, message.path)
+            case Resent():
+                self._resent = message.number
             case TellObjects() | SaveMap():
                 self.answer(message)
             case Finish():

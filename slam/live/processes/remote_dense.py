@@ -22,7 +22,7 @@ from pathlib import Path
 
 from bmask_slam.dense.growing.frames import FrameQueue, FramesTaken, ShownParts, SurfaceFrame
 from bmask_slam.dense.keyframe_input import KeyframeSnapshot
-from bmask_slam.graph.arrays import Floats
+from bmask_slam.graph.arrays import Bytes, Floats
 from bmask_slam.live.messages import Masks
 from bmask_slam.live.processes.dense_messages import (
     NO_POSES,
@@ -73,7 +73,7 @@ class RemoteDenseMapper:
         submaps: ids of those with a submap.
         previews: of finished submaps, which the viewer removes from here.
         keeps_previews: whether there is a viewer.
-        listeners: called with the keyframe's id and the points of each preview.
+        listeners: called with the keyframe's id, points and colours of each preview.
         skipped: keyframes of the map that will get no submap, and why.
         dropped: how many of those were dropped because newer ones came.
         unwritten: how many could not be written because the disk was full.
@@ -86,7 +86,7 @@ class RemoteDenseMapper:
         """Start the process; call ``wait_until_ready`` before the first keyframe."""
         self.submaps: set[int] = set()
         self.previews: dict[int, Preview] = {}
-        self.listeners: list[Callable[[int, Floats], None]] = []
+        self.listeners: list[Callable[[int, Floats, Bytes], None]] = []
         self.skipped: dict[int, str] = {}
         self.keeps_previews = True
         self.shown = ShownParts()
@@ -258,7 +258,7 @@ class RemoteDenseMapper:
             if self.keeps_previews:
                 self.previews[message.keyframe_id] = message.preview
             for listener in self.listeners:
-                listener(message.keyframe_id, message.preview.points)
+                listener(message.keyframe_id, message.preview.points, message.preview.colours)
 
     def _send_frame(self, frame: SurfaceFrame) -> None:
         self.worker.send(frame)

@@ -33,7 +33,7 @@ from bmask_slam.live.messages import (
     TellObjects,
     VisibilityCounts,
 )
-from bmask_slam.live.processes.map_worker import MapWorker
+from bmask_slam.live.processes.map_worker import MapPlace, MapWorker
 from bmask_slam.live.replica import apply_delta
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.semantics.instances.instances import PackedMask
@@ -70,7 +70,7 @@ class RemoteMapper:
     """
 
     def __init__(
-        self, camera: Camera, config: SystemConfig, names: tuple[str, ...], folder: Path
+        self, camera: Camera, config: SystemConfig, names: tuple[str, ...], place: MapPlace
     ) -> None:
         self.world, self.history = WorldMap(), FrameHistory()
         self.places = DescriptorIndex(config.loops.index)
@@ -80,13 +80,13 @@ class RemoteMapper:
         self.loops_closed = 0
         self.changes = 0
         self.reference: Keyframe | None = None
-        self._folder, self._has_labels = folder, len(names) > 1
+        self._folder, self._has_labels = place.folder, len(names) > 1
         self.objects: MapObjects | None = None
         self.maps_saved: list[MapSaved] = []
         self.extends, self._asked = True, False
         self._sent_frames = self._saved_keyframes = 0
         self._pending: set[int] = set()
-        self.worker = MapWorker((camera, config, names), self._replacement)
+        self.worker = MapWorker((camera, config, names), self._replacement, place)
 
     @property
     def pending(self) -> int:

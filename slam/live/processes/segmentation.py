@@ -11,7 +11,8 @@ from bmask_slam.datasets.weights import find_weights
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import ImageToSegment, Masks, NotSegmented, Ready
-from bmask_slam.live.processes.supervision import RestartPolicy, SupervisedWorker
+from bmask_slam.live.processes.supervision import DistantWorker, RestartPolicy, SupervisedWorker
+from bmask_slam.live.processes.worker import Workstation
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 
@@ -20,6 +21,8 @@ logger = logging.getLogger(__name__)
 NICENESS = 15
 MAX_WAITING = 4
 """Largest number of keyframes that wait for segmentation; the oldest are skipped."""
+MAX_KEPT = 100
+"""The same for a workstation, which may go away and catches up when it is back."""
 
 
 def serve_segmenter(
@@ -57,14 +60,24 @@ class RemoteSegmenter:
     """
 
     def __init__(
-        self, options: SegmenterOptions, sequence: Path, policy: RestartPolicy | None = None
+        self,
+        options: SegmenterOptions,
+        sequence: Path,
+        policy: RestartPolicy | None = None,
+        workstation: Workstation | None = None,
     ) -> None:
         """Start the process and wait until it is ready. Raises InputError if it cannot start."""
         self.dropped = 0
         self.segmentation_ms: list[float] = []
         self._requested: dict[int, ImageToSegment] = {}
-        target, arguments = f"{__name__}:serve_segmenter", (options, sequence, MAX_WAITING)
-        self.worker = SupervisedWorker("segmenter", target, arguments, policy or RestartPolicy())
+        self._most = MAX_WAITING if workstation is None else MAX_KEPT
+        arguments, name = (options, sequence, self._most), "segmenter"
+        self.worker: SupervisedWorker
+        if workstation is not None:
+            self.worker = DistantWorker(name, arguments, workstation)
+        else:
+            target = f"{__name__}:serve_segmenter"
+            self.worker = SupervisedWorker(name, target, arguments, policy or RestartPolicy())
         self.labels = LabelSet(self.worker.wait_until_ready().labels)
 
     @property
@@ -80,6 +93,9 @@ class RemoteSegmenter:
         """Request the masks of a keyframe; returns at once."""
         begins = not self._requested
         self._requested[image.keyframe_id] = image
+        if len(self._requested) > MAX_KEPT:  # of a process that is away
+            del self._requested[next(iter(self._requested))]
+            self.dropped += 1
         self.worker.send(image, begins)
 
     def receive_masks(self) -> list[Masks]:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import logging
+import queue
+import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.messages import Ready
-from bmask_slam.live.processes.worker import Failure, Worker
+from bmask_slam.live.processes.map_return import RETRY_S
+from bmask_slam.live.processes.worker import Failure, Worker, WorkerEnd, Workstation
 
 logger = logging.getLogger(__name__)
 
@@ -116,10 +120,7 @@ class SupervisedWorker:
         """Restart it if it died, or sent nothing for too long while ``busy``; whether it did."""
         if self.given_up:
             return False
-        silent_s = time.monotonic() - self._heard_s
-        limit_s = self._policy.answer_s if self._is_ready else self._policy.start_s
-        hangs = busy and silent_s > limit_s and not self._is_slow(silent_s, limit_s)
-        if self._worker.is_running and not hangs:
+        if self._worker.is_running and not (busy and self._hangs()):
             return False
         self.crashes += 1
         self._heard_s, self._used_s, self._is_ready = time.monotonic(), 0.0, False
@@ -135,6 +136,12 @@ class SupervisedWorker:
         """End the process at once."""
         self._worker.kill()
 
+    def _hangs(self) -> bool:
+        """Whether it has been silent for too long for one that has work."""
+        silent_s = time.monotonic() - self._heard_s
+        limit_s = self._policy.answer_s if self._is_ready else self._policy.start_s
+        return silent_s > limit_s and not self._is_slow(silent_s, limit_s)
+
     def _is_slow(self, silent_s: float, limit_s: float) -> bool:
         """Whether it works, but the machine is too busy for it to have been done by now."""
         used_s = self._worker.processor_s - self._used_s
@@ -143,5 +150,63 @@ class SupervisedWorker:
     def _now_heard(self) -> None:
         self._heard_s, self._used_s = time.monotonic(), self._worker.processor_s
 
-    def _start(self) -> Worker:
+    def _start(self) -> WorkerEnd:
         return Worker(self.name, self._target, *self.arguments)
+
+
+class DistantWorker(SupervisedWorker):
+    """A worker on a workstation. When that is lost, it is begun again as soon as that is back.
+
+    Only failures of its own count as crashes.
+    """
+
+    def __init__(self, name: str, arguments: tuple[Any, ...], workstation: Workstation) -> None:
+        """Start it. Raises InputError if the workstation cannot be reached."""
+        self._workstation = workstation
+        self._back: queue.SimpleQueue[WorkerEnd] = queue.SimpleQueue()
+        self._closed, self.is_away = threading.Event(), False
+        super().__init__(name, "", arguments, RestartPolicy())
+
+    def restart_if_needed(self, busy: bool) -> bool:
+        """Whether it has been begun again; waits for nothing."""
+        if self.is_away:
+            with suppress(queue.Empty):
+                self._worker = self._back.get_nowait()
+                self.is_away, self._is_ready = False, False
+                self._now_heard()
+                logger.warning("the workstation is back; the %s works again", self.name)
+                return True
+            return False
+        if self.given_up or (self._worker.is_running and not (busy and self._hangs())):
+            return False
+        self.crashes += not self._worker.was_killed
+        self._worker.kill()
+        if self.given_up:
+            logger.error("the %s died %d times; it is not restarted", self.name, self.crashes)
+            return False
+        logger.warning("the workstation's %s is lost; it is tried again", self.name)
+        self.is_away = True
+        threading.Thread(target=self._wait_for_it, name="workstation", daemon=True).start()
+        return False
+
+    def close(self) -> None:
+        """End it at once."""
+        self._closed.set()
+        super().close()
+        with suppress(queue.Empty):
+            self._back.get_nowait().kill()
+
+    def _wait_for_it(self) -> None:
+        while not self._closed.wait(RETRY_S):
+            try:
+                end = self._start()
+            except InputError as error:
+                logger.debug("%s", error)
+                continue
+            self._back.put(end)
+            if self._closed.is_set():
+                end.kill()
+            return
+
+    def _start(self) -> WorkerEnd:
+        return self._workstation.worker(self.name, self.arguments, None)

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Protocol
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.channel import Channel, ForwardedLog
@@ -34,10 +34,53 @@ logger = logging.getLogger(__name__)
 
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
 """Each worker uses one core at most: more threads of libraries would slow tracking down."""
-
-
+ENDING_S = 1.0
+"""Longest time for which a process that is ending by itself is waited for."""
 OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 """Exit codes of a process that another one has ended."""
+
+
+class WorkerEnd(Protocol):
+    """The owner's end of a worker, here or on a workstation; see `Worker`."""
+
+    @property
+    def pid(self) -> int: ...
+    @property
+    def processor_s(self) -> float: ...
+    @property
+    def is_running(self) -> bool: ...
+    @property
+    def was_killed(self) -> bool: ...
+    def send(self, message: Any) -> None: ...
+    def receive(self, timeout_s: float = 0.0) -> list[Any]: ...
+    def stop(self, timeout_s: float = 5.0) -> None: ...
+    def kill(self) -> None: ...
+
+
+class Traffic(Protocol):
+    """Bytes to a workstation and from it."""
+
+    @property
+    def sent_bytes(self) -> int: ...
+    @property
+    def received_bytes(self) -> int: ...
+
+
+class Workstation(Protocol):
+    """Another machine that runs workers."""
+
+    @property
+    def traffic(self) -> Traffic: ...
+
+    def worker(self, name: str, arguments: tuple[Any, ...], state: Path | None) -> WorkerEnd:
+        """Start one by its name, from a file of this machine if there is one.
+
+        Raises:
+            InputError: the machine cannot be reached, or refuses.
+        """
+
+    def is_reachable(self) -> bool:
+        """Whether something answers there."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +170,7 @@ class Worker:
         """Kill it. The messages that it sent before can still be received."""
         if not self._channel.open:  # it is ending by itself
             with suppress(subprocess.TimeoutExpired):
-                self._process.wait(1.0)
+                self._process.wait(ENDING_S)
         self._process.kill()
         self._process.wait()
         self._channel.drain()
@@ -156,6 +199,18 @@ def serve(connection: int, child_socket: int, parent_end: int) -> None:
     channel = Channel(Connection(connection), (Ring(parent_end), Ring(child_socket)))
     os.close(child_socket)
     os.close(parent_end)
+
+    def run(first: tuple[str, tuple[Any, ...]]) -> None:
+        module, _, function = first[0].partition(":")
+        target: Callable[..., None] = getattr(importlib.import_module(module), function)
+        gc.freeze()  # the collector need not scan all modules
+        target(channel, *first[1])
+
+    run_first(channel, run)
+
+
+def run_first(channel: Channel, run: Callable[[Any], None]) -> None:
+    """Do what the first message says; the log and a failure go to the owner."""
     logging.getLogger().addHandler(ForwardedLog(channel))
     logging.getLogger().setLevel(logging.INFO)
 
@@ -168,9 +223,6 @@ def serve(connection: int, child_socket: int, parent_end: int) -> None:
         channel.finish()
 
     sys.excepthook = send_failure
-    for target, arguments in itertools.islice(channel.messages(), 1):
-        module, _, function = target.partition(":")
-        run: Callable[..., None] = getattr(importlib.import_module(module), function)
-        gc.freeze()  # the collector need not scan all modules
-        run(channel, *arguments)
+    for first in itertools.islice(channel.messages(), 1):
+        run(first)
     channel.finish()

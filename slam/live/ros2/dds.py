@@ -1,45 +1,36 @@
 """ROS 2's wire: DDS topics of ROS names and types, whose messages are CDR as ROS 2 has it.
 
-The definitions of messages are those of rosbags' typestore, and so are their bytes: cyclonedds
-carries them. It knows the types by structs that are made from the same definitions.
+cyclonedds carries the bytes that rosbags makes. It knows the types by structs that are made from
+the same definitions. Services are those of rmw_cyclonedds: a request and its reply have the
+caller's number and that of the call, 16 bytes, before their fields. ROS 2 over another DDS has
+another way.
 """
 
 from __future__ import annotations
 
-import struct
+import os
 from collections.abc import Iterator
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import import_extra
+from bmask_slam.live.ros2.transport import (
+    SENSOR,
+    SOURCE,
+    STATE,
+    Quality,
+    decoded,
+    encoded,
+    typestore,
+)
 
 MAX_DOMAIN = 232
 HEADER_BYTES = 4
 """Of a message: how it is encoded."""
-_SOURCE = "ros2:"
-_BROKEN = (ValueError, AssertionError, LookupError, TypeError, struct.error, MemoryError)
+CALL_BYTES = 16
+"""Of a service's request or reply, behind that: who calls, and the number of the call."""
 _IDL_NAMES = {"bool": "boolean", "byte": "uint8", "char": "uint8", "octet": "uint8"}
-MORE_TYPES = {
-    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score",
-    "vision_msgs/msg/ObjectHypothesisWithPose":
-        "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
-    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
-    "vision_msgs/msg/Detection3D":
-        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\nstring id",
-    "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nDetection3D[] detections",
-}  # fmt: skip
-"""Fields of messages that rosbags does not have, as of vision_msgs 4 (Humble and later)."""
-
-
-@cache
-def typestore() -> Any:
-    """The definitions of ROS 2 Humble's messages, which later ROS 2 shares, and of MORE_TYPES."""
-    typesys = import_extra("rosbags.typesys", _SOURCE, "ros2")
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    for name, text in MORE_TYPES.items():
-        store.register(typesys.get_types_from_msg(text, name))
-    return store
 
 
 def dds_name(name: str) -> str:
@@ -59,7 +50,7 @@ def ros_name(name: str) -> str:
 @cache
 def idl_struct(name: str) -> Any:
     """The struct of a message type as cyclonedds knows it, with a field for each of the message."""
-    idl = import_extra("cyclonedds.idl", _SOURCE, "ros2")
+    idl = import_extra("cyclonedds.idl", SOURCE, "ros2")
     _, fields = typestore().fielddefs[name]
     made = idl.make_idl_struct(
         name.rpartition("/")[2], dds_name(name), {field: _idl_type(kind) for field, kind in fields}
@@ -70,7 +61,7 @@ def idl_struct(name: str) -> Any:
 
 def _idl_type(kind: tuple[Any, Any]) -> Any:
     """The type of a field in cyclonedds by its definition in rosbags."""
-    types = import_extra("cyclonedds.idl.types", _SOURCE, "ros2")
+    types = import_extra("cyclonedds.idl.types", SOURCE, "ros2")
     node, described = kind[0].name, kind[1]
     if node == "NAME":
         return idl_struct(described)
@@ -91,11 +82,11 @@ def carried_type(name: str) -> Any:
 
     Its own way through Python numbers would take longer for an image than a camera's interval.
     """
-    idl = import_extra("cyclonedds.idl", _SOURCE, "ros2")
+    idl = import_extra("cyclonedds.idl", SOURCE, "ros2")
     made = idl.make_idl_struct(
         f"Carried{name.rpartition('/')[2]}",
         dds_name(name),
-        {field: _idl_type(kind) for field, kind in typestore().fielddefs[name][1]},
+        _call_fields(name) | {f: _idl_type(kind) for f, kind in typestore().fielddefs[name][1]},
         dataclassify=False,
     )
     made.__idl_annotations__["extensibility"] = "final"
@@ -111,33 +102,15 @@ def carried_type(name: str) -> Any:
     return made
 
 
-def decoded(data: bytes, name: str) -> Any | None:
-    """The message of received bytes, None for bytes that are none of its type."""
-    broken = import_extra("rosbags.serde", _SOURCE, "ros2").SerdeError
-    try:
-        return typestore().deserialize_cdr(data, name)
-    except (broken, *_BROKEN):
-        return None
+def _call_fields(name: str) -> dict[str, Any]:
+    """What precedes the fields of a service's request or reply: CALL_BYTES."""
+    if name.split("/")[1] != "srv":
+        return {}
+    types = import_extra("cyclonedds.idl.types", SOURCE, "ros2")
+    return {"call_guid": types.uint64, "call_sequence": types.int64}
 
 
-class Quality(NamedTuple):
-    """Quality of service of a topic.
-
-    Attributes:
-        reliable: what is lost is sent again; else best effort, as ROS has for sensors.
-        latched: who joins later gets the last message (transient local).
-        depth: messages that are kept for a slow reader.
-    """
-
-    reliable: bool = False
-    latched: bool = False
-    depth: int = 5
-
-
-SENSOR, STATE, LATCHED = Quality(), Quality(True, depth=10), Quality(True, True, 1)
-
-
-class Writer:
+class DdsWriter:
     """Sends messages of one type on one topic."""
 
     def __init__(self, name: str, writer: Any) -> None:
@@ -145,13 +118,17 @@ class Writer:
 
     def send(self, message: Any) -> None:
         """Send a message of rosbags' class."""
+        self.send_bytes(encoded(message, self._name))
+
+    def send_bytes(self, data: bytes) -> None:
+        """Send a message that is encoded."""
         carried = carried_type(self._name)
         sample = carried.__new__(carried)
-        sample.cdr = bytes(typestore().serialize_cdr(message, self._name))
+        sample.cdr = data
         self._writer.write(sample)
 
 
-class Reader:
+class DdsReader:
     """Receives messages of one type on one topic.
 
     Attributes:
@@ -164,24 +141,64 @@ class Reader:
 
     def take(self, most: int = 16) -> Iterator[Any]:
         """What was received since the last call, as rosbags' classes."""
-        for sample in self._reader.take(most):
-            data = getattr(sample, "cdr", b"")
-            if len(data) <= HEADER_BYTES:
-                continue  # a publisher has gone
+        for data in self.take_bytes(most):
             message = decoded(data, self._name)
             if message is None:
                 self.broken += 1
             else:
                 yield message
 
+    def take_bytes(self, most: int = 16) -> Iterator[bytes]:
+        """The same, encoded."""
+        for sample in self._reader.take(most):
+            data = getattr(sample, "cdr", b"")
+            if len(data) > HEADER_BYTES:  # else a publisher has gone
+                yield data
 
-class Node:
+
+class DdsRequest:
+    """A call of a service, to be answered to who called."""
+
+    def __init__(self, message: Any, call: bytes, service: DdsService) -> None:
+        self.message = message
+        self._call, self._service = call, service
+
+    def reply(self, message: Any) -> None:
+        """Answer it."""
+        self._service.send(message, self._call)
+
+
+class DdsService:
+    """One end of a service of a type: receives calls and answers them.
+
+    The other way round it is a client, which sends calls and receives answers.
+    """
+
+    def __init__(self, names: tuple[str, str], reader: DdsReader, writer: DdsWriter) -> None:
+        """``names`` of the messages that are received and sent."""
+        self._names, self._reader, self._writer = names, reader, writer
+
+    def take(self) -> Iterator[DdsRequest]:
+        """What was received since the last call; what cannot be decoded is left out."""
+        begin = HEADER_BYTES + CALL_BYTES
+        for data in self._reader.take_bytes():
+            message = decoded(data[:HEADER_BYTES] + data[begin:], self._names[0])
+            if len(data) > begin and message is not None:
+                yield DdsRequest(message, data[HEADER_BYTES:begin], self)
+
+    def send(self, message: Any, call: bytes) -> None:
+        """Send a message of a call, which is named by CALL_BYTES bytes."""
+        data = encoded(message, self._names[1])
+        self._writer.send_bytes(data[:HEADER_BYTES] + call + data[HEADER_BYTES:])
+
+
+class DdsNode:
     """A participant in a DDS domain, as every ROS 2 node has one."""
 
     def __init__(self, domain: int) -> None:
         """Raises InputError: cyclonedds is not installed, or the domain cannot be joined."""
         self._dds = {
-            part: import_extra(f"cyclonedds.{part}", _SOURCE, "ros2")
+            part: import_extra(f"cyclonedds.{part}", SOURCE, "ros2")
             for part in ("core", "domain", "pub", "sub", "topic", "qos", "util", "builtin")
         }
         if not 0 <= domain <= MAX_DOMAIN:
@@ -204,22 +221,33 @@ class Node:
                 self._published[topic.removeprefix("rt")] = kind
         return dict(self._published)
 
-    def writer(self, topic: str, name: str, quality: Quality = STATE) -> Writer:
+    def writer(self, topic: str, name: str, quality: Quality = STATE) -> DdsWriter:
         """A publisher of messages of the type ``name``, such as sensor_msgs/msg/Image."""
-        qos = self._qos(quality)
-        made = self._dds["pub"].DataWriter(self._participant, self._topic(topic, name), qos=qos)
-        return Writer(name, made)
+        return self._writer(f"rt{topic}", name, self._qos(quality))
 
-    def reader(self, topic: str, name: str, quality: Quality = SENSOR) -> Reader:
+    def reader(self, topic: str, name: str, quality: Quality = SENSOR) -> DdsReader:
         """A subscription; one of best effort hears reliable publishers too."""
-        qos = self._qos(quality)
-        made = self._dds["sub"].DataReader(self._participant, self._topic(topic, name), qos=qos)
-        return Reader(name, made)
+        return self._reader(f"rt{topic}", name, self._qos(quality))
 
-    def _topic(self, topic: str, name: str) -> Any:
-        return self._dds["topic"].Topic(self._participant, f"rt{topic}", carried_type(name))
+    def service(self, service: str, name: str, calls: bool = False) -> DdsService:
+        """Serve a service, or with ``calls`` be a client of it."""
+        ends = (f"rq{service}Request", f"{name}_Request"), (f"rr{service}Reply", f"{name}_Response")
+        (topic, received), (back, sent) = ends[::-1] if calls else ends
+        role = "clientid" if calls else "serviceid"
+        number = ".".join(f"{byte:x}" for byte in os.urandom(12))  # by which ROS finds the pair
+        qos = self._qos(Quality(reliable=True, depth=10), f"{role}={number};")
+        reader = self._reader(topic, received, qos)
+        return DdsService((received, sent), reader, self._writer(back, sent, qos))
 
-    def _qos(self, quality: Quality) -> Any:
+    def _writer(self, dds_topic: str, name: str, qos: Any) -> DdsWriter:
+        topic = self._dds["topic"].Topic(self._participant, dds_topic, carried_type(name))
+        return DdsWriter(name, self._dds["pub"].DataWriter(self._participant, topic, qos=qos))
+
+    def _reader(self, dds_topic: str, name: str, qos: Any) -> DdsReader:
+        topic = self._dds["topic"].Topic(self._participant, dds_topic, carried_type(name))
+        return DdsReader(name, self._dds["sub"].DataReader(self._participant, topic, qos=qos))
+
+    def _qos(self, quality: Quality, user_data: str = "") -> Any:
         policy, duration = self._dds["qos"].Policy, self._dds["util"].duration
         reliable = policy.Reliability.Reliable(duration(milliseconds=100))
         latched = policy.Durability.TransientLocal
@@ -228,4 +256,5 @@ class Node:
             latched if quality.latched else policy.Durability.Volatile,
             policy.History.KeepLast(quality.depth),
             policy.DataRepresentation(use_cdrv0_representation=True),
+            *([policy.Userdata(user_data.encode())] if user_data else ()),
         )

@@ -8,7 +8,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Bytes
 from bmask_slam.graph.geometry import adjoint, make_pose, quaternion_from_rotation
-from bmask_slam.live.ros2.dds import typestore
+from bmask_slam.live.ros2.transport import typestore
 from bmask_slam.mapping.products.occupancy import OccupancyGrid
 
 UNKNOWN_VARIANCE = 1e6

@@ -12,7 +12,6 @@ from bmask_slam.graph.arrays import Array, Bytes
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, make_pose, orthonormalised
 from bmask_slam.labelling.results import MapObjects
-from bmask_slam.live.ros2.dds import LATCHED, STATE, Node
 from bmask_slam.live.ros2.messages import (
     header,
     message,
@@ -24,6 +23,7 @@ from bmask_slam.live.ros2.messages import (
     type_name,
 )
 from bmask_slam.live.ros2.objects import detection_array, marker_array
+from bmask_slam.live.ros2.transport import LATCHED, STATE, Node
 from bmask_slam.mapping.products.occupancy import OccupancyGrid
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
@@ -47,6 +47,7 @@ class Ros2Frames:
         floor_m: height of the floor in the base's frame, for the grid. Where the camera's place
             is not known, the floor is the lowest level with many points.
         grid_resolution_m: edge of the grid's cells.
+        cloud_voxel_m: the dense cloud has one point in each cube of this edge.
         grid_low_m, grid_high_m: what is lower above the floor is driven over, higher under.
     """
 
@@ -61,8 +62,11 @@ class Ros2Frames:
     grid_resolution_m: float = 0.05
     grid_low_m: float = 0.1
     grid_high_m: float = 1.5
+    cloud_voxel_m: float = 0.03
 
     def __post_init__(self) -> None:
+        if not self.cloud_voxel_m > 0:
+            raise InputError(f"cloud_voxel_m: {self.cloud_voxel_m:g} is no edge of a cube")
         if self.base_camera:
             T = np.array(self.base_camera)
             good = T.size == 16 and np.isfinite(T).all()
@@ -120,6 +124,7 @@ class Ros2Outputs:
         self._path = writer(f"{prefix}/path", "Path", LATCHED)
         self._landmarks = writer(f"{prefix}/landmarks", "PointCloud2", LATCHED)
         self._grid = writer(f"{prefix}/map", "OccupancyGrid", LATCHED)
+        self._cloud = writer(f"{prefix}/cloud", "PointCloud2", LATCHED)
         self._markers = writer(f"{prefix}/object_markers", "MarkerArray", LATCHED)
         self._detections = writer(f"{prefix}/objects", "Detection3DArray", LATCHED)
         self._diagnostics = writer("/diagnostics", "DiagnosticArray")
@@ -184,6 +189,14 @@ class Ros2Outputs:
     def grid(self, stamp_s: float, grid: OccupancyGrid, floor_m: float) -> None:
         """Publish the map to drive on; ``floor_m`` is the floor's height in the map's frame."""
         self._grid.send(occupancy_grid(stamp_s, self._frames.map, grid, floor_m))
+
+    def cloud(self, stamp_s: float, points_map: Array, colours: Bytes) -> None:
+        """Publish the dense map's points (N, 3), in the map's frame, with colours (N, 3)."""
+        self._cloud.send(point_cloud(stamp_s, self._frames.map, points_map, colours))
+
+    def begin(self) -> None:
+        """Forget where odometry's frame was in the map: another map begins."""
+        self._T_map_odom = None
 
     def health(self, stamp_s: float, values: dict[str, Any]) -> None:
         """Publish numbers and texts by name; ``status`` gives the level."""

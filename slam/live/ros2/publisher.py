@@ -7,26 +7,26 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import asdict, replace
 from typing import Any, Protocol
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Floats
+from bmask_slam.graph.arrays import Array, Bytes, Floats
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud, MapObjects
-from bmask_slam.live.ros2.dds import Node
-from bmask_slam.live.ros2.grid import GridOptions, LiveGrid
+from bmask_slam.live.ros2.grid import GridOptions, LiveCloud, LiveGrid
 from bmask_slam.live.ros2.outputs import Robot, Ros2Frames, Ros2Outputs
+from bmask_slam.live.ros2.transport import Node
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 logger = logging.getLogger(__name__)
 
 PERIOD_S, OBJECTS_S, GRID_S = 1.0, 3.0, 5.0
-"""Between two messages with path, landmarks and health; with objects; with the grid."""
+"""Between two messages with path, landmarks and health; with objects; with grid and cloud."""
 GRID_SHARE = 0.1
-"""Of a processor that the grid may take: it is made less often if it takes longer."""
+"""Of a processor that grid and cloud may take: they are made less often if it takes longer."""
 NICENESS = 15
 MAX_POSES, MAX_POINTS = 1000, 20_000
 """Of the path, and of landmarks, those seen most often, in a message."""
@@ -41,7 +41,7 @@ class LiveRun(Protocol):
     def segment(self) -> int: ...
     def keyframe_poses(self) -> dict[int, Array]: ...
     def objects(self) -> MapObjects | None: ...
-    def on_submap(self, listener: Callable[[int, Floats], None]) -> None: ...
+    def on_submap(self, listener: Callable[[int, Floats, Bytes], None]) -> None: ...
 
 
 class Ros2Publisher:
@@ -53,25 +53,26 @@ class Ros2Publisher:
 
     def __init__(self, node: Node, frames: Ros2Frames, robot: Robot) -> None:
         self._outputs, self._ros_time = Ros2Outputs(node, frames, robot), robot.ros_time
-        options = GridOptions(
+        self._T_map_world, self._voxel_m = robot.T_base_camera, frames.cloud_voxel_m
+        self._grid_options = GridOptions(
             frames.grid_resolution_m,
             frames.grid_low_m,
             frames.grid_high_m,
             frames.floor_m if robot.is_known else None,
         )
-        self._grid = LiveGrid(robot.T_base_camera, options)
+        self._begin()
         self._thread = ThreadPoolExecutor(1, "grid", _with_low_priority)
         self._making: Future[float] | None = None
         self._run: LiveRun | None = None
-        self._segment = 0
-        self._due_s = {"map": 0.0, "objects": 0.0, "grid": 0.0}
         self._told: MapObjects | None = None
 
     def __call__(self, result: FrameResult, run: LiveRun) -> None:
         """Publish a result, and what is due."""
         if run is not self._run:
+            if self._run is not None:
+                self._clear(self._ros_time(result.timestamp_s))
             self._run = run
-            run.on_submap(self._grid.add)
+            run.on_submap(self._add_submap)
         if result.segment != self._segment and result.status is not TrackingStatus.LOST:
             self._segment_may_have_changed(run)
         self._outputs.frame(result, known=result.segment == self._segment)
@@ -85,6 +86,27 @@ class Ros2Publisher:
                 self._outputs.objects(stamp_s, found)
         if self._is_due("grid", GRID_S):
             self._publish_grid(stamp_s, run)
+
+    def _begin(self) -> None:
+        """Nothing is known of a run's map yet, and everything is due."""
+        self._segment = 0
+        self._due_s = {"map": 0.0, "objects": 0.0, "grid": 0.0}
+        self._grid = LiveGrid(self._T_map_world, self._grid_options)
+        self._cloud = LiveCloud(self._T_map_world, self._voxel_m)
+
+    def _clear(self, stamp_s: float) -> None:
+        """Another run has begun: what was published of the one before is none of its map."""
+        wait([self._making] if self._making else [])
+        self._begin()
+        self._outputs.begin()
+        if self._told is not None:
+            self._outputs.objects(stamp_s, replace(self._told, objects=[]))
+        none = np.zeros((0, 3))
+        self._outputs.cloud(stamp_s, none, none.astype(np.uint8))
+
+    def _add_submap(self, number: int, points: Floats, colours: Bytes) -> None:
+        self._grid.add(number, points)
+        self._cloud.add(number, points, colours)
 
     def _segment_may_have_changed(self, run: LiveRun) -> None:
         segment = run.segment()
@@ -119,11 +141,14 @@ class Ros2Publisher:
         self._making = self._thread.submit(self._make_grid, stamp_s, run.keyframe_poses())
 
     def _make_grid(self, stamp_s: float, poses: dict[int, Array]) -> float:
-        """Make and publish the grid; returns the time of the processor that it took."""
+        """Publish grid and cloud; returns the time of the processor that they took."""
         begin_s = time.thread_time()
         found = self._grid.grid(poses)
         if found is not None:
             self._outputs.grid(stamp_s, *found)
+        cloud = self._cloud.cloud(poses)
+        if cloud is not None:
+            self._outputs.cloud(stamp_s, *cloud)
         return time.thread_time() - begin_s
 
 

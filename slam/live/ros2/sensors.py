@@ -16,7 +16,7 @@ from bmask_slam.graph.geometry import inverse, quaternion_from_rotation
 from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.graph.sensors.odometry import interpolated
 from bmask_slam.graph.sensors.streams import Measurements, measurements
-from bmask_slam.live.ros2.dds import SENSOR, Node, Reader
+from bmask_slam.live.ros2.transport import SENSOR, Node, Reader
 from bmask_slam.sequences.bags.ros_images import stamp_s
 from bmask_slam.sequences.bags.sensors import FIX, TYPES, SensorTopics, east_north_up, sensor_row
 

@@ -7,10 +7,15 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.live.ros2.dds import DdsNode
+from bmask_slam.live.ros2.transport import Node
 from bmask_slam.live.sources.bag_source import BagSource
+from bmask_slam.live.sources.cameras.azure_camera import AzureSource
+from bmask_slam.live.sources.cameras.oak_camera import OakSource
+from bmask_slam.live.sources.cameras.opencv_camera import OpenCvSource
+from bmask_slam.live.sources.cameras.realsense_camera import RealSenseSource
+from bmask_slam.live.sources.cameras.record3d_camera import Record3dSource
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
-from bmask_slam.live.sources.opencv_camera import OpenCvSource
-from bmask_slam.live.sources.realsense_camera import RealSenseSource
 from bmask_slam.live.sources.ros2_source import Ros2Options, Ros2Source
 from bmask_slam.live.sources.source import Limited, RecordedSource, Source
 from bmask_slam.sequences import open_sequence
@@ -19,7 +24,8 @@ from bmask_slam.sequences.bags.sensors import SensorTopics
 from bmask_slam.sequences.bags.topics import BagTopics
 from bmask_slam.sequences.formats.layouts import is_recording_file
 
-REALSENSE, OPENCV, ROS2 = "realsense:", "opencv:", "ros2:"
+REALSENSE, OAK, OPENCV, ROS2 = "realsense:", "oak:", "opencv:", "ros2:"
+AZURE, RECORD3D = "azure:", "record3d:"
 
 
 @dataclass(frozen=True)
@@ -35,6 +41,7 @@ class SourceOptions:
         topics: of a bag, or of ROS 2.
         reliable: ROS 2 sends images again that are lost.
         sensors: topics of ROS 2.
+        node: takes part in ROS 2, in place of one of DDS.
     """
 
     camera: Path | None = None
@@ -45,22 +52,23 @@ class SourceOptions:
     topics: BagTopics = field(default_factory=BagTopics)
     reliable: bool = False
     sensors: SensorTopics = field(default_factory=SensorTopics)
+    node: Node | None = None
 
 
 def open_source(text: str, options: SourceOptions) -> Source:
-    """Open a recording in any layout, a bag, ``realsense:`` or ``opencv:N``.
+    """Open a recording in any layout, a bag, a camera by its name, or ROS 2.
 
     Raises:
         InputError: the name is none of these, or the source cannot be opened.
     """
     path = Path(text)
     source: Source
-    if text == REALSENSE:
-        source = RealSenseSource(options.camera, options.silence_s)
-    elif text.startswith(OPENCV):
-        source = OpenCvSource(_device(text), options.camera, options.silence_s)
+    if (camera := _camera(text, options)) is not None:
+        source = camera
     elif text.startswith(ROS2):
-        source = Ros2Source(_domain(text), _of_ros2(options))
+        domain = _domain(text)
+        node = options.node or DdsNode(domain)
+        source = Ros2Source(node, f"{ROS2}{domain}", _of_ros2(options))
     elif is_bag(path):
         source = BagSource(path, options.topics, options.camera, options.realtime)
     elif options.follow:
@@ -72,7 +80,7 @@ def open_source(text: str, options: SourceOptions) -> Source:
     else:
         raise InputError(
             f"{text}: not a source; give a recording, a .bag, a bag folder, a .mcap, "
-            "realsense:, opencv:N or ros2:"
+            "realsense:, oak:, azure:, opencv:N, record3d: or ros2:"
         )
     return source if options.max_frames is None else Limited(source, options.max_frames)
 
@@ -96,8 +104,22 @@ def _domain(text: str) -> int:
     return int(number)
 
 
-def _device(text: str) -> int:
-    number = text.removeprefix(OPENCV)
-    if not number.isdecimal():
-        raise InputError(f"{text}: not the number of a device; write e.g. opencv:0")
-    return int(number)
+def _camera(text: str, options: SourceOptions) -> Source | None:
+    """The camera that is plugged in, by its name; None if it is no name of one."""
+    prefix, colon, number = text.partition(":")
+    given = options.camera, options.silence_s
+    if f"{prefix}{colon}" == REALSENSE:
+        return RealSenseSource(*given, recording=Path(number) if number else None)
+    if text == OAK:
+        return OakSource(*given)
+    kinds = {OPENCV: OpenCvSource, AZURE: AzureSource, RECORD3D: Record3dSource}
+    kind = kinds.get(f"{prefix}{colon}")
+    return None if kind is None else kind(_device(text, number), *given)
+
+
+def _device(text: str, number: str) -> int:
+    """The number of a device; of none the first."""
+    if not (number or "0").isdecimal():
+        prefix = text.partition(":")[0]
+        raise InputError(f"{text}: not the number of a device; write e.g. {prefix}:0")
+    return int(number or 0)

@@ -18,8 +18,8 @@ from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.live.ros2.dds import LATCHED, SENSOR, STATE, Node, Reader
 from bmask_slam.live.ros2.sensors import ImageClock, Ros2Sensors, mounted
+from bmask_slam.live.ros2.transport import LATCHED, SENSOR, STATE, Node, Reader
 from bmask_slam.live.sources.message_frames import message_frames
 from bmask_slam.live.sources.pairing import DEPTH, RGB, Pair, Pairer
 from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
@@ -122,20 +122,22 @@ class Ros2Source(MeasuredSource):
 
     waits = False
 
-    def __init__(self, domain: int, options: Ros2Options) -> None:
+    def __init__(self, node: Node, name: str, options: Ros2Options) -> None:
         """Wait until somebody publishes the images and their camera, and the sensors' topics.
+
+        ``name``, such as ros2:0, is for messages and the run folder.
 
         Raises:
             InputError: nobody does for ``silence_s``, or the camera cannot be used.
         """
-        self.name = "ros2" if domain == 0 else f"ros2-{domain}"
+        self.name = name.replace(":", "-").removesuffix("-0").strip("-")
         self.groundtruth: Trajectory | None = None
         self.counts = SourceCounts()
-        self.node = Node(domain)
+        self.node = node
         self.deliver: Callable[[Measurements], None] = lambda _: None
         self._silence_s = options.silence_s
-        self._closed = threading.Event()
-        self._where = f"ros2:{domain}"
+        self._closed, self._played = threading.Event(), 0
+        self._where = name
         self._heard = _Heard(self.node, self._where)
         heard = cast("Bag", self._heard)
         self._topics = self._wait_for_topics(heard, options.topics)
@@ -197,9 +199,11 @@ class Ros2Source(MeasuredSource):
 
     def _pairs(self) -> Iterator[Pair[Any]]:
         pairer = self._pairer
+        self._played += 1  # what iterated before ends
+        mine = self._played
         heard_s = time.monotonic()
         broken = 0
-        while not self._closed.is_set():
+        while not self._closed.is_set() and mine == self._played:
             found = []
             for stream, reader in ((RGB, self._readers[0]), (DEPTH, self._readers[1])):
                 for message in reader.take():
@@ -217,7 +221,8 @@ class Ros2Source(MeasuredSource):
                 )
             else:
                 self._closed.wait(POLL_S)
-        yield from pairer.finish()
+        if mine == self._played:
+            yield from pairer.finish()
 
     def _hand_on(self, at_once: bool) -> None:
         """Hand on what was measured: before frames, else from time to time."""

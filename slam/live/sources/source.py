@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from itertools import islice
@@ -227,10 +227,11 @@ class Newest(Generic[T]):
         with self._changed:
             return not self._kept and self._end.done() and self._end.exception() is None
 
-    def stop(self) -> None:
-        """Read no further item."""
+    def stop(self, wait_s: float = 0.0) -> None:
+        """Read no further item; waits so long for one that is being read."""
         self._stopped = True
         self._thread.shutdown(wait=False)
+        wait([self._end], wait_s)
 
     def _read_all(self) -> None:
         for item in self._items:

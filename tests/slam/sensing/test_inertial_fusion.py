@@ -10,10 +10,11 @@ import pytest
 from synthetic_view import CAMERA, render_or_black
 
 from bmask_slam.config.configuration import resolve
-from bmask_slam.events import EventKind
+from bmask_slam.events import Event, EventKind
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_update import GraphUpdate
 from bmask_slam.graph.geometry import inverse, make_pose, se3_log, so3_exp
+from bmask_slam.graph.sensors.mounting import T_of
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.rendering.sensors import imu
 from bmask_slam.system import SlamSystem
@@ -138,3 +139,43 @@ def test_a_saved_graph_has_the_imu_and_loses_it_with_its_keyframes(
     assert middle not in left.states
     assert ("bias", pairs[6][1], 0) in left.slots
     assert np.isfinite(again.marginals().keyframes).all()
+
+
+def test_a_mounting_that_is_not_given_is_estimated_and_used() -> None:
+    """Reported with its sigma; restored in the middle: the same bytes."""
+    free = replace(CONFIG.sensors.imu, imu_in_camera=None)
+    config = replace(CONFIG, sensors=replace(CONFIG.sensors, imu=free))
+    rows = readings()
+    first, second = SlamSystem(CAMERA, config), SlamSystem(CAMERA, config)
+    first.add_imu(rows[:, 0], rows[:, 1:4], rows[:, 4:])
+    frames = [replace(render_or_black(POSES[k], k), timestamp_s=STAMPS_S[k]) for k in range(30)]
+    events: list[Event] = []
+    for frame in frames[:25]:
+        events += first.process(frame).events
+    first.restart()
+    second.restore(first.state(), Path("run/checkpoint"))
+    for system in (first, second):
+        for frame in frames[25:]:
+            events += system.process(frame).events
+        system.finish()
+        system.mapper.update_ms = []
+    said = [event.text for event in events if event.kind is EventKind.SENSOR]
+    assert said[0].startswith("imu: mounting estimated, sensors.imu.imu_in_camera=[")
+    found = first.mapper.sensors.imu
+    T = T_of((*found.found[:7].tolist(),))
+    off = se3_log(inverse(T_of(MOUNTING)) @ T)
+    assert np.linalg.norm(off[:3]) < 4 * found.sigma_rad < 0.02
+    inertial = first.mapper.smoother.tables.inertial
+    assert len(inertial.factors) > 5
+    down = R_UPRIGHT_WORLD.T @ [0.0, 0.0, -1.0]
+    assert np.arccos(inertial.down[0] @ down) < 0.03
+    states = [system.state() for system in (first, second)]
+    for name in states[0]:
+        np.testing.assert_array_equal(states[0][name], states[1][name], name)
+    found.found = found.found + np.eye(8)[0] * 0.01  # better known: all is made anew
+    first.mapper.add_waiting_measurements()
+    inertial = first.mapper.smoother.tables.inertial
+    assert {f.model.T_camera_imu[0, 3] for f in inertial.factors.values()} == {found.found[0]}
+    names = [name for name in inertial.slots if name[0] == "imu"]
+    assert sorted(name[1:] for name in names) == sorted(inertial.factors)
+    assert not [name for name in inertial.slots if name[0] == "replaced"]

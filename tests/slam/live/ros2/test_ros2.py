@@ -26,9 +26,10 @@ from bmask_slam.graph.geometry import (
     se3_log,
 )
 from bmask_slam.graph.sensors.mounting import T_of
-from bmask_slam.live.ros2.dds import carried_type, dds_name, ros_name, typestore
+from bmask_slam.live.ros2.dds import carried_type, dds_name, ros_name
 from bmask_slam.live.ros2.messages import ros_covariance
 from bmask_slam.live.ros2.outputs import OPTICAL, Ros2Frames
+from bmask_slam.live.ros2.transport import typestore
 from bmask_slam.live.sources.opening import SourceOptions, open_source
 from bmask_slam.system_config import SystemConfig
 
@@ -117,7 +118,7 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
             "off",
             "--quiet",
             "--silence",
-            "30",
+            "300",
         )
         code = main(["live", f"ros2:{DOMAIN}", "--out", str(out), "--max-frames", str(FRAMES - 2),
                      *options])  # fmt: skip

@@ -17,12 +17,12 @@ from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud, MapObjects
 from bmask_slam.live.health import Health
 from bmask_slam.live.ros2 import publisher
-from bmask_slam.live.ros2.dds import typestore
 from bmask_slam.live.ros2.grid import GridOptions, LiveGrid
 from bmask_slam.live.ros2.messages import occupancy_grid
 from bmask_slam.live.ros2.objects import detection_array, marker_array
 from bmask_slam.live.ros2.outputs import OPTICAL, Robot, Ros2Frames
 from bmask_slam.live.ros2.publisher import Ros2Publisher
+from bmask_slam.live.ros2.transport import typestore
 from bmask_slam.mapping.products.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
@@ -173,12 +173,12 @@ def test_maps_are_published_when_they_are_due(monkeypatch) -> None:
         publish(FrameResult(k, 5 + k / 10, TrackingStatus.OK, np.eye(4), segment), run)
         if k == 0:
             (add,) = run.listeners
-            add(4, room(2.02))
+            add(4, room(2.02), np.zeros((len(room(2.02)), 3), np.uint8))
     assert publish._making is not None
     publish._making.result(10)
     counts = {topic: len(sent) for topic, sent in node.topics.items()}
     assert counts["/bmask_slam/odometry"] == counts["/bmask_slam/pose"] == 79
     assert counts["/bmask_slam/path"] == counts["/diagnostics"] == 8
     assert counts["/bmask_slam/objects"] == counts["/bmask_slam/object_markers"] == 1
-    assert 1 <= counts["/bmask_slam/map"] <= 2
+    assert 1 <= counts["/bmask_slam/map"] == counts["/bmask_slam/cloud"] <= 2
     assert node.topics["/bmask_slam/map"][-1].info.width > 20

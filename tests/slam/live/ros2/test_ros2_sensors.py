@@ -17,10 +17,10 @@ from bmask_slam.graph.geometry import inverse, make_pose, se3_exp
 from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.graph.sensors.mounting import T_of
 from bmask_slam.graph.sensors.streams import Measurements, SensorStreams
-from bmask_slam.live.ros2.dds import typestore
 from bmask_slam.live.ros2.messages import header, message
 from bmask_slam.live.ros2.outputs import OPTICAL, Robot, Ros2Frames, Ros2Outputs
 from bmask_slam.live.ros2.sensors import FAR_S, ImageClock, Ros2Sensors, mounted
+from bmask_slam.live.ros2.transport import typestore
 from bmask_slam.sequences.bags.sensors import SensorTopics
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 

@@ -15,8 +15,9 @@ import pytest
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.live.sources.opencv_camera import OpenCvSource
-from bmask_slam.live.sources.realsense_camera import RealSenseSource, fit_distortion
+from bmask_slam.live.sources.cameras.camera_source import fit_distortion
+from bmask_slam.live.sources.cameras.opencv_camera import OpenCvSource
+from bmask_slam.live.sources.cameras.realsense_camera import RealSenseSource
 from bmask_slam.sequences import write_camera
 
 SILENCE_S = 0.3

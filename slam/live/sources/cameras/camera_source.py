@@ -1,4 +1,4 @@
-"""The base class of sources that read a connected camera."""
+"""The base class of sources that read a connected camera, and how they find its intrinsics."""
 
 from __future__ import annotations
 
@@ -6,17 +6,26 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from pathlib import Path
 from typing import NamedTuple
 
-from bmask_slam.graph.arrays import Floats, Image
-from bmask_slam.graph.camera import Camera
+import numpy as np
+
+from bmask_slam.graph.arrays import Array, Floats, Image
+from bmask_slam.graph.camera import Camera, distortion_terms
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.sources.pairing import RGB, GapMeter, StreamClock
 from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
+from bmask_slam.sequences import read_camera
+from bmask_slam.sequences.camera_presets import is_preset
+from bmask_slam.sequences.cameras import given_camera
+from bmask_slam.sequences.checks import check_depth_scale
 from bmask_slam.sequences.frame import Frame
 
 RETRY_S = 0.01
+MAX_RESIDUAL_PX = 0.5
+"""Largest error, over the image, of OpenCV's five distortion coefficients fitted to a device."""
 
 
 class CameraImages(NamedTuple):
@@ -89,3 +98,54 @@ class CameraSource(MeasuredSource, ABC):
             raise InputError(
                 f"{self.name}: no frame for {self._silence_s:g} s; is the camera still plugged in?"
             )
+
+
+def chosen_camera(given: Path | None, own: Camera, where: str) -> Camera:
+    """The camera file that was given, what it leaves out or else all by the device's ``own``.
+
+    Raises:
+        InputError: a file with another depth scale than the device's; ``where`` names its depth.
+    """
+    if given is None:
+        return own
+    if is_preset(given):
+        return given_camera(given, own)
+    camera = read_camera(given)
+    check_depth_scale(camera, own.depth_scale, str(given), where)
+    return camera
+
+
+def pixel_grid(width: int, height: int) -> Array:
+    """Pixels (N, 2) all over an image."""
+    steps = np.linspace(0.02, 0.98, 20)
+    columns, rows = np.meshgrid(steps * width, steps * height)
+    return np.column_stack([columns.ravel(), rows.ravel()])
+
+
+def fit_distortion(camera: Camera, pixels: Array, rays: Array) -> Camera:
+    """The camera with the distortion that projects ``rays`` to ``pixels``, by least squares.
+
+    OpenCV's model is linear in k1, k2, p1, p2, k3 (``graph.camera.distortion_terms``).
+
+    Args:
+        pixels: (N, 2). rays: (N, 2) undistorted, at z = 1.
+
+    Raises:
+        InputError: the largest residual is too large, as for a fisheye lens.
+    """
+    terms = distortion_terms(rays)
+    A = np.concatenate([camera.fx * terms[:, 0], camera.fy * terms[:, 1]])
+    shift = pixels - (rays * [camera.fx, camera.fy] + [camera.cx, camera.cy])
+    b = shift.T.ravel()
+    solution = np.linalg.lstsq(A, b, rcond=None)[0]
+    residual_px = float(np.abs(A @ solution - b).max())
+    if residual_px > MAX_RESIDUAL_PX:
+        raise InputError(
+            f"the camera's distortion differs from OpenCV's by {residual_px:.1f} px; calibrate it "
+            "and give --camera F"
+        )
+    k1, k2, p1, p2, k3 = (float(value) for value in solution)
+    return Camera(
+        camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
+        (k1, k2, p1, p2, k3), camera.depth_scale, camera.fps,
+    )  # fmt: skip

@@ -8,45 +8,58 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.camera import Camera, distortion_terms
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.extras import import_extra
-from bmask_slam.live.sources.camera_source import CameraImages, CameraSource
+from bmask_slam.graph.extras import import_extra, load_libusb
+from bmask_slam.live.sources.cameras.camera_source import (
+    CameraImages,
+    CameraSource,
+    chosen_camera,
+    fit_distortion,
+    pixel_grid,
+)
 from bmask_slam.live.sources.pairing import MAX_DIFFERENCE_S
-from bmask_slam.sequences import read_camera
 from bmask_slam.sequences.camera_presets import is_preset
-from bmask_slam.sequences.cameras import given_camera
-from bmask_slam.sequences.checks import check_depth_scale
 from bmask_slam.sequences.images import depth_in_metres
 
 SIZE = (640, 480)
 FPS = 30
 POLL_MS = 200
-MAX_RESIDUAL_PX = 0.5
-"""Largest error, over the image, of OpenCV's five distortion coefficients fitted to the device."""
 
 
 class RealSenseSource(CameraSource):
-    """The first connected device, 640x480 at 30 Hz."""
+    """The first connected device, 640x480 at 30 Hz, or a recording that plays in its place."""
 
-    def __init__(self, camera: Path | None = None, silence_s: float = 10.0) -> None:
-        """Start the device.
+    def __init__(
+        self, camera: Path | None = None, silence_s: float = 10.0, recording: Path | None = None
+    ) -> None:
+        """Start the device; ``recording`` is a file of RealSense's own tools.
 
         Raises:
             InputError: pyrealsense2 is not installed, there is no device, or its distortion cannot
                 be described by OpenCV's model.
         """
-        super().__init__("realsense", silence_s)
+        super().__init__("realsense" if recording is None else recording.stem, silence_s)
+        load_libusb()
         self._rs: Any = import_extra("pyrealsense2", "realsense:", "realsense")
         rs = self._rs
         self._pipeline, self._align = rs.pipeline(), rs.align(rs.stream.color)
         streams = rs.config()
-        streams.enable_stream(rs.stream.color, *SIZE, rs.format.rgb8, FPS)
-        streams.enable_stream(rs.stream.depth, *SIZE, rs.format.z16, FPS)
+        size: tuple[int, ...] = SIZE
+        if recording is not None:
+            if not recording.is_file():
+                raise InputError(f"{recording}: no such recording")
+            streams.enable_device_from_file(str(recording), repeat_playback=False)
+            size = ()  # as it was recorded
+        rate_hz = FPS if recording is None else 0
+        streams.enable_stream(rs.stream.color, *size, rs.format.rgb8, rate_hz)
+        streams.enable_stream(rs.stream.depth, *size, rs.format.z16, rate_hz)
+        self._is_recorded = recording is not None
         try:
-            profile = self._pipeline.start(streams)
+            self._profile = profile = self._pipeline.start(streams)
         except RuntimeError as error:
-            raise InputError(f"realsense: cannot start ({error}); plug the camera in") from error
+            cure = "plug the camera in" if recording is None else "record colour (RGB8) and depth"
+            raise InputError(f"realsense: cannot start ({error}); {cure}") from error
         try:
             self.camera = self._find_camera(profile, camera)
         except BaseException:
@@ -56,6 +69,8 @@ class RealSenseSource(CameraSource):
     def _capture_images(self) -> CameraImages | None:
         received, images = self._pipeline.try_wait_for_frames(POLL_MS)
         if not received:
+            if self._is_recorded and self._has_ended():
+                self.close()
             return None
         aligned = self._align.process(images)
         colour, depth = aligned.get_color_frame(), aligned.get_depth_frame()
@@ -69,18 +84,20 @@ class RealSenseSource(CameraSource):
             1e-3 * colour.get_timestamp(), rgb, depth_in_metres(stored, self.camera)
         )
 
+    def _has_ended(self) -> bool:
+        playback = self._profile.get_device().as_playback()
+        return bool(playback.current_status() == self._rs.playback_status.stopped)
+
     def _release(self) -> None:
         self._pipeline.stop()
 
     def _find_camera(self, profile: Any, given: Path | None) -> Camera:
         """The given camera, or the device's own calibration."""
         scale = 1.0 / float(profile.get_device().first_depth_sensor().get_depth_scale())
-        if given is not None and not is_preset(given):
-            camera = read_camera(given)
-            check_depth_scale(camera, scale, str(given), "realsense's depth")
-            return camera
-        own = self._own_camera(profile, scale)
-        return own if given is None else given_camera(given, own)
+        if given is not None and not is_preset(given):  # its distortion need not fit OpenCV's
+            nominal = Camera(*SIZE, 1.0, 1.0, 0.0, 0.0, depth_scale=scale)
+            return chosen_camera(given, nominal, "realsense's depth")
+        return chosen_camera(given, self._own_camera(profile, scale), "realsense's depth")
 
     def _own_camera(self, profile: Any, scale: float) -> Camera:
         """The device's calibration, whose depth is ``scale`` to the metre."""
@@ -94,40 +111,9 @@ class RealSenseSource(CameraSource):
 
     def _samples(self, intrinsics: Any) -> tuple[Array, Array]:
         """Pixels (N, 2) on a grid, and their rays (N, 2) at z = 1 by the device's model."""
-        steps = np.linspace(0.02, 0.98, 20)
-        columns, rows = np.meshgrid(steps * intrinsics.width, steps * intrinsics.height)
-        pixels = np.column_stack([columns.ravel(), rows.ravel()])
+        pixels = pixel_grid(intrinsics.width, intrinsics.height)
         deproject = self._rs.rs2_deproject_pixel_to_point
         return pixels, np.array([deproject(intrinsics, list(p), 1.0)[:2] for p in pixels])
-
-
-def fit_distortion(camera: Camera, pixels: Array, rays: Array) -> Camera:
-    """The camera with the distortion that projects ``rays`` to ``pixels``, by least squares.
-
-    OpenCV's model is linear in k1, k2, p1, p2, k3 (``graph.camera.distortion_terms``).
-
-    Args:
-        pixels: (N, 2). rays: (N, 2) undistorted, at z = 1.
-
-    Raises:
-        InputError: the largest residual is too large, as for a fisheye lens.
-    """
-    terms = distortion_terms(rays)
-    A = np.concatenate([camera.fx * terms[:, 0], camera.fy * terms[:, 1]])
-    shift = pixels - (rays * [camera.fx, camera.fy] + [camera.cx, camera.cy])
-    b = shift.T.ravel()
-    solution = np.linalg.lstsq(A, b, rcond=None)[0]
-    residual_px = float(np.abs(A @ solution - b).max())
-    if residual_px > MAX_RESIDUAL_PX:
-        raise InputError(
-            f"the camera's distortion differs from OpenCV's by {residual_px:.1f} px; calibrate it "
-            "and give --camera F"
-        )
-    k1, k2, p1, p2, k3 = (float(value) for value in solution)
-    return Camera(
-        camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
-        (k1, k2, p1, p2, k3), camera.depth_scale, camera.fps,
-    )  # fmt: skip
 
 
 def _lag_s(colour: Any, depth: Any) -> float:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.live.sources.camera_source import CameraImages, CameraSource
+from bmask_slam.live.sources.cameras.camera_source import CameraImages, CameraSource
 from bmask_slam.sequences.cameras import given_camera
 from bmask_slam.sequences.checks import check_depth_scale, check_sizes
 from bmask_slam.sequences.images import depth_in_metres

@@ -1,0 +1,1 @@
+"""The map and masks on another machine: a connection, its two ends, and what goes over it."""

@@ -1,0 +1,1 @@
+"""Depth cameras that are plugged in, each by its own library."""

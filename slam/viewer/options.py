@@ -1,0 +1,44 @@
+"""Where a run is shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+LOCAL = "127.0.0.1"
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Where the scene is shown: in Rerun, in Foxglove, or in both.
+
+    Attributes:
+        record: Rerun recording to write.
+        serve: port of Rerun's web viewer; 0: none.
+        window: show it in Rerun's own window.
+        host: address that the servers listen on.
+        foxglove_file: MCAP file to write.
+        foxglove_port: of a websocket that Foxglove connects to; 0: none.
+    """
+
+    record: Path | None = None
+    serve: int = 0
+    window: bool = False
+    host: str = LOCAL
+    foxglove_file: Path | None = None
+    foxglove_port: int = 0
+
+    @property
+    def in_rerun(self) -> bool:
+        """Whether Rerun shows it."""
+        return self.record is not None or self.serve > 0 or self.window
+
+    @property
+    def in_foxglove(self) -> bool:
+        """Whether Foxglove does."""
+        return self.foxglove_file is not None or self.foxglove_port > 0
+
+    @property
+    def enabled(self) -> bool:
+        """Whether it is shown at all."""
+        return self.in_rerun or self.in_foxglove

@@ -1,0 +1,445 @@
+"""The map and masks on another machine: who is admitted, the same result, and the way back."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA
+from test_live_faults import label_image
+from test_map_process import keyframe
+
+from bmask_slam.cli import main
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import read_arrays
+from bmask_slam.live.channel import END
+from bmask_slam.live.messages import (
+    STATE_FILE,
+    Finish,
+    ImageToSegment,
+    MapSaved,
+    Ready,
+    Resent,
+    SaveMap,
+    SaveState,
+    Started,
+    StateSaved,
+)
+from bmask_slam.live.network import server as server_module
+from bmask_slam.live.network.carrying import PIECE, CarriedFiles, FilePiece, Outbox, store
+from bmask_slam.live.network.connection import Connection, admit, introduce, make_token, read_token
+from bmask_slam.live.network.server import WorkstationServer
+from bmask_slam.live.network.workstation import Workstation
+from bmask_slam.live.processes import map_return, map_worker, supervision
+from bmask_slam.live.processes.map_process import MapServer
+from bmask_slam.live.processes.map_worker import MapPlace, MapWorker
+from bmask_slam.live.processes.segmentation import RemoteSegmenter
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.world.frame_history import ENTRY
+
+TOKEN = b"a token for the tests only"
+NONE = np.zeros(0, ENTRY)
+
+
+def until(holds: Callable[[], Any], timeout_s: float = 60.0) -> None:
+    """Wait until something holds."""
+    end_s = time.monotonic() + timeout_s
+    while not holds():
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def both_ends() -> tuple[socket.socket, socket.socket]:
+    """Two ends of a connection of TCP."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        one = socket.create_connection(server.getsockname())
+        return one, server.accept()[0]
+
+
+class Cut:
+    """Between robot and workstation: hands bytes on, until it is cut; refuses while ``away``."""
+
+    def __init__(self, port: int) -> None:
+        self._end = socket.create_server(("127.0.0.1", 0))
+        self.port, self._to = self._end.getsockname()[1], port
+        self.away = False
+        self._ends: list[socket.socket] = []
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        """The workstation goes away."""
+        self.away = True
+        for end in self._ends:
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        self._end.close()
+        self.cut()
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                end = self._end.accept()[0]
+                if self.away:
+                    end.close()
+                    continue
+                other = socket.create_connection(("127.0.0.1", self._to))
+                self._ends += [end, other]
+                for one, two in ((end, other), (other, end)):
+                    threading.Thread(target=self._hand_on, args=(one, two), daemon=True).start()
+
+    def _hand_on(self, one: socket.socket, two: socket.socket) -> None:
+        with suppress(OSError):
+            while data := one.recv(1 << 16):
+                two.sendall(data)
+            two.shutdown(socket.SHUT_RDWR)
+
+
+@pytest.fixture
+def cut() -> Iterator[Cut]:
+    """A workstation behind a connection that can be cut."""
+    server = WorkstationServer("127.0.0.1", 0, TOKEN)
+    thread = threading.Thread(target=server.serve)
+    thread.start()
+    with closing(server), closing(Cut(server.port)) as between:
+        yield between
+        server._closed.set()
+        thread.join(10)
+
+
+def workstation(cut: Cut, token: bytes = TOKEN) -> Workstation:
+    return Workstation("127.0.0.1", cut.port, token)
+
+
+# --- who is admitted -----------------------------------------------------------------------------
+
+
+def test_only_who_knows_the_token_is_admitted(cut, monkeypatch) -> None:
+    started: list[Any] = []
+    monkeypatch.setattr(server_module, "_started", lambda *_: started.append(1))
+    with pytest.raises(InputError, match="another token"):
+        workstation(cut, b"another token of the tests").worker("map", ())
+    with socket.create_connection(("127.0.0.1", cut.port)) as end:
+        end.sendall(b"GET / HTTP/1.0\r\n".ljust(200))  # what it sends is never unpickled
+        assert end.recv(1000).startswith(b"bmask-slam ")  # and the end, or nothing more
+    assert not started
+    cut.away = True
+    with pytest.raises(InputError, match="cannot be reached"):
+        workstation(cut).worker("map", ())
+
+
+def test_who_is_silent_is_dropped(cut, monkeypatch) -> None:
+    monkeypatch.setattr(server_module, "HANDSHAKE_S", 0.2)
+    with socket.create_connection(("127.0.0.1", cut.port)) as end:
+        end.settimeout(10)
+        assert end.recv(1) == b""
+
+
+def test_another_version_is_said() -> None:
+    one, two = both_ends()
+    two.sendall(b"bmask-slam 8".ljust(64, b"\0"))
+    with pytest.raises(InputError, match=r"'bmask-slam 8'.*install the same"):
+        introduce(one, TOKEN)
+    one.close()
+    two.close()
+
+
+def test_messages_arrive_and_changed_ones_end_the_connection() -> None:
+    one, two = both_ends()
+    admitted: list[Any] = []
+    thread = threading.Thread(target=lambda: admitted.append(admit(two, TOKEN)))
+    thread.start()
+    keys = introduce(one, TOKEN)
+    thread.join()
+    sender, receiver = Connection(one, keys), Connection(two, admitted[0])
+    large = np.arange(30_000).tobytes()
+    sender.send((b"pickle", [large, memoryview(b"")]))
+    assert receiver.recv() == (b"pickle", [large, b""])
+    assert receiver.received_bytes == sender.sent_bytes < len(large)  # compressed
+    before = one.fileno()
+    kept: list[bytes] = []
+    tap = SimpleNamespace(sendall=lambda data: kept.append(bytes(data)), fileno=lambda: before)
+    sender._end = tap
+    sender.send((b"second", []))
+    for data in (b"".join(kept), b"".join(kept)):
+        one.sendall(data)  # the second time it is a replay
+    assert receiver.recv() == (b"second", [])
+    with pytest.raises(ConnectionAbortedError, match="not sent"):
+        receiver.recv()
+
+
+def test_tokens(tmp_path: Path) -> None:
+    path = tmp_path / "config" / "token"
+    with pytest.raises(InputError, match="copy the token"):
+        read_token(path)
+    make_token(path)
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert len(read_token(path)) > 40
+    found = Workstation.of("[::1]:99", path)
+    assert (found.host, found.port) == ("::1", 99)
+    assert str(read_token(path)) not in repr(found)
+    path.write_text("short")
+    with pytest.raises(InputError, match="not safe"):
+        Workstation.of("host", path)
+    with pytest.raises(InputError, match="no address"):
+        Workstation.of("host:port", path)
+
+
+def test_the_command_makes_a_token_and_listens(tmp_path, monkeypatch, capsys) -> None:
+    served: list[Any] = []
+    monkeypatch.setattr(WorkstationServer, "serve", lambda self, ends: served.append(ends()))
+    path = tmp_path / "token"
+    assert main(["workstation", "--port", "0", "--token-file", str(path)]) == 0
+    assert served == [False]
+    assert "listening on 127.0.0.1:" in capsys.readouterr().out
+    assert main(["live", str(tmp_path), "--workstation", "a:b", "--token-file", str(path)]) == 1
+
+
+# --- files ---------------------------------------------------------------------------------------
+
+
+def test_files_wait_for_messages_and_a_newer_one_takes_their_place() -> None:
+    box, path = Outbox(), Path("state")
+    old, new, other = (FilePiece(p, 0, NONE) for p in (path, path, Path("map")))
+    for item in (old, replace(old, begin=9), other, 1, END, new, 2):
+        box.put(item)
+    assert [box.get() for _ in range(5)] == [1, 2, other, new, END]
+
+
+def test_files_of_the_map_are_carried_to_the_robots_paths(tmp_path: Path) -> None:
+    here, robot, sent = tmp_path / "workstation", tmp_path / "state", []
+    here.mkdir()
+    asked = [
+        (1, SaveState(robot)),
+        (2, SaveMap(tmp_path / "map")),
+        (3, Finish(robot, NONE)),
+        (4, 5),
+    ]
+    channel: Any = SimpleNamespace(send=sent.append, messages=lambda: iter(asked))
+    files = CarriedFiles(channel, here)
+    (_, save), (_, as_map), (_, finish), other = files.messages()
+    assert other == (4, 5)
+    assert {save.path.parent, as_map.path.parent, finish.path.parent} == {here}
+    data = np.random.default_rng(0).bytes(PIECE + 5)
+    save.path.write_bytes(data)
+    files.send(StateSaved(1, save.path))
+    files.send(MapSaved(as_map.path, "no space"))
+    files.send("other")
+    assert sent[2:] == [MapSaved(tmp_path / "map", "no space"), "other"]
+    assert store(sent[0], str) is None
+    assert not robot.exists()
+    assert store(sent[1], str) == StateSaved(1, robot)
+    assert robot.read_bytes() == data
+    lost = replace(sent[1], path=tmp_path / "gone" / "state")
+    assert store(lost, lambda error: error.errno) == 2
+
+
+# --- the map's process, with stand-ins -----------------------------------------------------------
+
+
+class End:
+    """Stands in for a worker: what was sent to it, and what it answers."""
+
+    pid, processor_s, was_killed = 1, 0.0, True
+
+    def __init__(self, *given: Any) -> None:
+        self.given, self.sent, self.answers, self.is_running = given, [], [], True  # type: ignore[var-annotated]
+
+    def send(self, message: Any) -> None:
+        self.sent.append(message)
+
+    def receive(self, timeout_s: float = 0.0) -> list[Any]:
+        time.sleep(0 if self.answers else min(timeout_s, 0.02))
+        found = list(self.answers)
+        self.answers.clear()
+        return found
+
+    def kill(self) -> None:
+        self.is_running = False
+
+    stop = kill
+
+
+@dataclass(eq=False)
+class Away:
+    """Stands in for a workstation, and keeps the workers of both machines."""
+
+    there: list[End]
+    here: list[End]
+    away: bool = False
+
+    def worker(self, name: str, arguments: Any, state: Path | None) -> End:
+        self.there.append(End(name, arguments, state))
+        return self.there[-1]
+
+    def is_reachable(self) -> bool:
+        return not self.away
+
+
+@pytest.fixture
+def machines(monkeypatch) -> Away:
+    """Both machines, without processes."""
+    found = Away([], [])
+
+    def start(*given: Any) -> End:
+        found.here.append(End(*given))
+        return found.here[-1]
+
+    monkeypatch.setattr(map_worker, "Worker", start)
+    monkeypatch.setattr(map_return, "RETRY_S", 0.02)
+    monkeypatch.setattr(supervision, "RETRY_S", 0.02)
+    return found
+
+
+def test_the_map_goes_on_here_and_back_with_all_messages(machines, tmp_path: Path) -> None:
+    worker = MapWorker(("a",), lambda message: None, MapPlace(tmp_path, machines))
+    first = machines.there[0]
+    assert (worker.workstation, first.given[1:]) == ("connected", (("a", 0), None))
+    worker.send("one")
+    worker.send("two")
+    first.answers += [Ready(), StateSaved(1, tmp_path / "s1"), Started(2), "late"]
+    assert worker.receive() == ["late"]
+    machines.away, first.is_running = True, False
+    assert worker.has_crashed
+    worker.receive_last()
+    worker.restart()
+    assert (worker.workstation, worker.losses, worker.crashes) == ("away", 1, 0)
+    here = machines.here[0]  # it was started before, and has waited
+    assert here.sent == [("a", tmp_path / "s1", 2), (2, "two")]
+    worker.send("three")
+    machines.away = False
+    until(lambda: worker.receive() or len(here.sent) > 3)
+    number, save = here.sent[-1]
+    assert (number, type(save)) == (4, SaveState)
+    worker.send("five")
+    here.answers += [StateSaved(4, save.path), StateSaved(5, tmp_path / "s5")]
+    worker.receive()
+    worker.send("six")
+    until(lambda: len(machines.there) > 1)
+    back = machines.there[1]
+    assert back.given == ("map", ("a", 0), save.path)
+    back.answers += ["before", Ready(), "first"]
+    here.answers.append("last of here")
+    found: list[Any] = []
+    until(lambda: found.extend(worker.receive()) or worker.workstation == "connected")
+    assert found == ["last of here"]
+    assert worker.receive() == ["before", "first"]
+    assert not here.is_running
+    assert back.sent == [(0, Resent(6)), (5, "five"), (6, "six")]  # since the state that it has
+    back.is_running = False
+    worker.restart()  # from the newer state, which contains 5
+    assert machines.here[1].sent == [("a", tmp_path / "s5", 6), (6, "six")]
+    worker.kill()
+
+
+def test_a_failure_there_counts_and_the_end_stays_here(machines, tmp_path: Path) -> None:
+    worker = MapWorker((), lambda message: None, MapPlace(tmp_path, machines))
+    worker.send("bad")
+    machines.there[0].answers += [Ready(), Started(1)]
+    worker.receive()
+    machines.there[0].is_running = machines.there[0].was_killed = False
+    machines.away = True
+    worker.restart()
+    assert (worker.crashes, worker.losses) == (1, 0)
+    worker.send(Finish(tmp_path / "final", NONE))
+    machines.away = False
+    time.sleep(0.2)
+    worker.receive()
+    assert len(machines.there) == 1
+    assert len(machines.here[0].sent) == 3
+
+
+# --- with processes ------------------------------------------------------------------------------
+
+
+def messages(folder: Path) -> list[Any]:
+    """What tracking sends: four keyframes, a state, and the end."""
+    system = SlamSystem(CAMERA)
+    last = Finish(folder / "final", NONE)
+    made = [keyframe(system, k, (k - 1, np.eye(4)) if k else None) for k in range(4)]
+    return [*made[:2], SaveState(folder / "saved"), *made[2:], last]
+
+
+def test_the_same_map_as_here_also_after_the_workstation_was_lost(
+    cut, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(map_return, "RETRY_S", 0.1)
+    sent, answers = messages(tmp_path), []  # type: ignore[var-annotated]
+    local = MapServer(SlamSystem(CAMERA), answers.append)
+    for number, message in enumerate(sent, 1):
+        local.handle(number, message)
+    expected, saved = (read_arrays(tmp_path / n, STATE_FILE)[1] for n in ("final", "saved"))
+    (tmp_path / "final").unlink()
+    (tmp_path / "saved").unlink()
+    arguments = CAMERA, SystemConfig(), ("background",)
+    place = MapPlace(tmp_path, workstation(cut))
+    worker = MapWorker(arguments, lambda message: None, place)
+    received: list[Any] = []
+
+    def step() -> None:
+        received.extend(worker.receive(0.02))
+        if worker.has_crashed:
+            received.extend(worker.receive_last())
+            worker.restart()
+
+    with closing(SimpleNamespace(close=worker.kill)):
+        for message in sent[:3]:
+            worker.send(message)
+        until(lambda: step() or worker.saves == 1)
+        found = read_arrays(tmp_path / "saved", STATE_FILE)[1]
+        assert found.keys() == saved.keys()
+        for name, array in saved.items():  # the same bytes, however they were sent
+            if name != "mapper.update_ms":
+                np.testing.assert_array_equal(found[name], array, err_msg=name)
+        traffic = place.workstation.traffic  # type: ignore[union-attr]
+        assert traffic.sent_bytes > 100_000 < traffic.received_bytes
+        cut.cut()
+        worker.send(sent[3])
+        until(lambda: step() or worker.workstation == "away")
+        until(lambda: step() or any(getattr(m, "keyframe_id", -1) == 2 for m in received))
+        cut.away = False
+        until(lambda: step() or worker.workstation == "connected")
+        worker.send(sent[4])
+        worker.send(sent[5])
+        until(lambda: step() or not worker.busy)
+    found = read_arrays(tmp_path / "final", STATE_FILE)[1]
+    assert found.keys() == expected.keys()
+    for name in ("mapper.world.keyframes.T_world_camera", "mapper.world.landmarks.points_world"):
+        np.testing.assert_allclose(found[name], expected[name], atol=1e-3)
+    assert worker.losses == 1
+
+
+def test_masks_come_from_the_workstation_and_later_if_it_was_away(
+    cut, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(supervision, "RETRY_S", 0.1)
+    options = label_image(tmp_path)
+    with closing(RemoteSegmenter(options, tmp_path, workstation=workstation(cut))) as segmenter:
+        image = np.zeros((480, 640, 3), np.uint8)
+        found: dict[int, Any] = {}
+
+        def step() -> bool:
+            found.update({m.keyframe_id: m.instances for m in segmenter.receive_masks()})
+            return False
+
+        segmenter.request(ImageToSegment(0, image, "a.png"))
+        until(lambda: step() or 0 in found)
+        cut.cut()
+        until(lambda: step() or segmenter.worker.is_away)  # type: ignore[attr-defined]
+        for number in range(1, 9):
+            segmenter.request(ImageToSegment(number, image, "a.png"))
+        assert segmenter.worker.crashes == 0
+        cut.away = False
+        until(lambda: step() or len(found) == 9)
+        assert len(found[0]) == len(found[8]) > 0
