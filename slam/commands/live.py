@@ -205,21 +205,16 @@ def _next_run(options: LiveOptions) -> LiveOptions:
     from bmask_slam.run_folder.open_files import free_run_path
 
     assert options.out is not None
-    return replace(
-        options, out=free_run_path(options.out.name, options.out.parent), overwrite=False
-    )
+    out = free_run_path(options.out.name, options.out.parent)
+    return replace(options, out=out, overwrite=False)
 
 
 def _tell(
     arguments: argparse.Namespace, slam: LiveSlam, source: Source, ended_by: int | None
 ) -> int:
     """Print what came of a run; returns the exit code."""
-    found: dict[str, Any] = {
-        "folder": slam.out,
-        "calibration": slam.calibration,
-        "source": source.counts.line(),
-    }
-    found |= {"stopped_by": ended_by or None, "metrics": slam.rows}
+    found: dict[str, Any] = {"folder": slam.out, "calibration": slam.calibration}
+    found |= {"source": source.counts.line(), "stopped_by": ended_by or None, "metrics": slam.rows}
     found |= {"dense_points": None if slam.dense is None else slam.dense.points}
     print_result(arguments, slam.out, lambda: _summary(slam, source), found)
     return 128 + ended_by if ended_by else 0
@@ -241,11 +236,9 @@ def measured_beside(
     path = Path(arguments.source)
     if given and not is_bag(path):
         raise InputError(f"{arguments.source}: no bag; leave {given[0]} out")
-    return (
-        read_sensors(path, SensorTopics(**topics))
-        if given
-        else read_folder(folder, config.sensors.enabled)
-    )
+    if given:
+        return read_sensors(path, SensorTopics(**topics))
+    return read_folder(folder, config.sensors.enabled)
 
 
 def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:

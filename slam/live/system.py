@@ -260,9 +260,8 @@ class LiveSystem(SlamSystem):
         path = self.remote.finish(FINISH_S)
         state = read_arrays(path, STATE_FILE)[1]
         own = nested(dynamics=self.moving_objects.state())
-        whole = SlamSystem(
-            self.camera, self.config, LabelsOnly(self.label_names, self.config.semantics.segmenter)
-        )
+        labels = LabelsOnly(self.label_names, self.config.semantics.segmenter)
+        whole = SlamSystem(self.camera, self.config, labels)
         whole.restore({**state, **own}, path)
         self.map, self.camera_tracker = whole.map, whole.camera_tracker
         self.semantics, self.moving_objects = whole.semantics, whole.moving_objects

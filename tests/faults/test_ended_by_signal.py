@@ -67,7 +67,7 @@ def handler(arguments):
     print("started", flush=True)
     time.sleep(60)
 
-arguments = SimpleNamespace(handler=handler, verbose=False)
+arguments = SimpleNamespace(handler=handler, verbose=False, command="run")
 cli.make_parser = lambda: SimpleNamespace(parse_args=lambda _: arguments)
 sys.exit(cli.main())
 """

@@ -58,7 +58,7 @@ def test_memory_that_runs_out(
             raise ERRORS[what]
 
     parser = SimpleNamespace(
-        parse_args=lambda argv: SimpleNamespace(handler=handler, verbose=False)
+        parse_args=lambda argv: SimpleNamespace(handler=handler, verbose=False, command="run")
     )
     monkeypatch.setattr(cli, "make_parser", lambda: parser)
     assert cli.main([]) == 1
