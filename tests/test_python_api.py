@@ -23,6 +23,7 @@ REFERENCE = (ROOT / "docs/python.md").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 MAX_IMPORT_S = 0.2
+FRAMES = 14
 MAX_QUICK_START_LINES = 12
 
 
@@ -146,7 +147,7 @@ def recording(slow_office: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
         os.symlink(slow_office / name, path / name)
     lines = (slow_office / "rgb.txt").read_text().splitlines(keepends=True)
     listed = [line for line in lines if not line.startswith("#")]
-    (path / "rgb.txt").write_text("".join(listed[:24]))
+    (path / "rgb.txt").write_text("".join(listed[:FRAMES]))
     os.symlink(path / "groundtruth.txt", folder / "groundtruth.txt")
     return path
 
@@ -155,7 +156,7 @@ def test_the_quick_start_runs_as_it_stands(recording: Path) -> None:
     (code,) = PYTHON.findall(README)
     assert len(code.splitlines()) <= MAX_QUICK_START_LINES
     lines = output(code, recording.parents[2]).splitlines()
-    assert re.fullmatch(r"24 poses, \d{3,} landmarks", lines[0])
+    assert re.fullmatch(rf"{FRAMES} poses, \d{{3,}} landmarks", lines[0])
     value, unit = lines[-1].split()
     assert float(value) < 0.01 and unit == "m"
     run = bmask_slam.Run(recording.parents[2] / "runs/first")
@@ -167,5 +168,5 @@ def test_the_quick_start_runs_as_it_stands(recording: Path) -> None:
 def test_the_examples_of_the_reference_run_as_they_stand(recording: Path) -> None:
     (code,) = PYTHON.findall(REFERENCE)
     *frames, shapes = output(code, recording.parents[2]).splitlines()
-    assert len(frames) == 24
-    assert shapes.startswith("(24, 3) (")
+    assert len(frames) == FRAMES
+    assert shapes.startswith(f"({FRAMES}, 3) (")

@@ -344,7 +344,7 @@ def test_a_run_can_fuse_keyframes_while_tracking(
     assert len(counts["label_shares"]) > 3
     coarse_points = counts["points"]
     capsys.readouterr()
-    assert main(["map", str(run)]) == 0  # with finer voxels
+    assert main(["map", str(run), "--mesh-voxel", "0.02"]) == 0
     assert f"0 fused, {total} were finished" in capsys.readouterr().out
     assert json.loads((run / "dense" / "dense.json").read_text())["points"] > 3 * coarse_points
 
