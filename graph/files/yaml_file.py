@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 from copy import deepcopy
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -95,14 +96,12 @@ def parse_yaml(text: str, source: str) -> Any:
             twice, other values than plain ones, or a document that is too large; names the line if
             there is one.
     """
-    reader = YAML(typ="safe", pure=True)
-    reader.Constructor = _Constructor
     if not isinstance(text, str):
         raise InputError(f"{source}: a YAML text was expected, not {type(text).__name__}")
     if len(text) > MAX_BYTES:
         raise InputError(f"{source}: {len(text)} characters, more than {MAX_BYTES}")
     try:
-        return reader.load(text)
+        return deepcopy(_parsed(text))
     except MarkedYAMLError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
         problem = (error.problem or "not a YAML text").partition(" with value")[0]
@@ -125,22 +124,41 @@ def read_yaml(file: Path) -> Any:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{file}: not a text file; {_CURE}") from error
-    document = deepcopy(_parsed(text, str(file)))
+    document = parse_yaml(text, str(file))
     return {} if document is None else document
 
 
-@lru_cache(maxsize=8)
-def _parsed(text: str, source: str) -> Any:
-    """As `parse_yaml`; each system of a process reads the same files, and that takes long."""
-    return parse_yaml(text, source)
+@lru_cache(maxsize=16)
+def _parsed(text: str) -> Any:
+    """The document of a text, not to be changed: a process reads the same ones, which takes long.
+
+    Raises what ruamel.yaml raises.
+    """
+    reader = YAML(typ="safe", pure=True)
+    reader.Constructor = _Constructor
+    return reader.load(text)
 
 
 def format_yaml(document: Any, flow: bool = False) -> str:
     """YAML text of plain values in their own order; ``flow`` puts it on one line."""
+    return _formatted(_Document(repr(document), document), flow)
+
+
+@dataclass(frozen=True)
+class _Document:
+    """Plain values, which are compared by their ``text`` in Python."""
+
+    text: str
+    values: Any = field(compare=False)
+
+
+@lru_cache(maxsize=8)
+def _formatted(document: _Document, flow: bool) -> str:
+    """Each checkpoint of a run holds the same configuration, whose YAML takes 0.1 s."""
     writer = YAML(typ="safe", pure=True)
     writer.Representer = _Representer
     writer.default_flow_style, writer.width = flow, 10**6 if flow else 100
     writer.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
     out = io.StringIO()
-    writer.dump(document, out)
+    writer.dump(document.values, out)
     return out.getvalue().removesuffix("...\n").strip() if flow else out.getvalue()

@@ -188,7 +188,8 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     header, arrays = read_arrays(path, CHECKPOINT_FILE)
     config = resolve(SystemConfig, folder / "config.yaml")
     try:
-        if from_text(SystemConfig, header["config"], str(path)) != config:
+        written = header["config"]
+        if written != dump(config) and from_text(SystemConfig, written, str(path)) != config:
             raise InputError(
                 f"{folder / 'config.yaml'}: not the configuration that {path.name} was made with; "
                 "restore it, or start a new run"
