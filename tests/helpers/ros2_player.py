@@ -40,11 +40,12 @@ T_BASE_CAMERA = make_pose(
 T_ODOM_MAP = se3_exp(np.array([0, 0, 0.7, 3.0, -2.0, 0]))
 BEGIN_S = 1000.0
 LONGEST_S = 120.0
-PLACES = 10
+PLACES, WAITING = 10, 300
 
 
 def place(k: int) -> int:
-    """Which of the PLACES frame k is taken from, to and fro."""
+    """Which of the PLACES frame k is taken from, to and fro; the first as long as k < 0."""
+    k = max(k, 0)
     return abs((k + PLACES - 1) % (2 * PLACES - 2) - (PLACES - 1))
 
 
@@ -155,7 +156,7 @@ def main() -> None:
     heard: dict[str, list] = {topic: [] for topic in HEARD}
     rendered = [render_plane(pose(k), k) for k in range(PLACES)]
     caller = Caller(node, sys.argv[4:])
-    k, end_s, ends = 0, time.monotonic() + LONGEST_S, False
+    k, end_s, ends = -WAITING, time.monotonic() + LONGEST_S, False
     while not ends and time.monotonic() < end_s:
         ends = bool(select.select([sys.stdin], [], [], 0)[0])  # what came until then is read
         for topic, reader in readers.items():
@@ -168,7 +169,8 @@ def main() -> None:
         depths.send(image(stamp_s, "32FC1", frame.depth_m.astype(np.float32)))
         if heard["/bmask_slam/odometry"]:
             caller.step(k)
-        k += bool(heard["/bmask_slam/odometry"])  # the first is repeated until somebody tracks
+        # the camera waits at its first place until it hears that somebody tracks
+        k = max(k + 1, 0) if heard["/bmask_slam/odometry"] else min(k + 1, -1)
         time.sleep(1 / rate_hz)
     Path(out).write_text(json.dumps(heard | {"answers": caller.answers}))
 
