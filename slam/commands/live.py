@@ -284,10 +284,10 @@ def _workstation_of(arguments: argparse.Namespace) -> Workstation | None:
 
 
 def _summary(slam: LiveSlam, source: Source) -> str:
-    lines = [format_summary(slam.rows)]
+    lines = [format_summary(slam.rows), ""]
     if slam.calibration:
-        lines.append(f"\nCamera      {slam.calibration}")
-    lines.append(f"\nRun folder  {slam.out}")
+        lines.append(f"Camera      {slam.calibration}")
+    lines.append(f"Run folder  {slam.out}")
     if slam.dense is not None:
         lines.append(
             f"Dense map   {slam.out}/dense, {slam.dense.points} points"

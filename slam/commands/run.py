@@ -148,16 +148,16 @@ def _plain_summary(summary: RunSummary) -> dict[str, Any]:
 
 
 def _summary(summary: RunSummary) -> str:
-    lines = [format_summary(summary.rows)]
+    lines = [format_summary(summary.rows), ""]
     if summary.calibration:
-        lines.append(f"\nCamera      {summary.calibration}")
-    lines += [f"\nWarning     {warning}" for warning in summary.warnings]
+        lines.append(f"Camera      {summary.calibration}")
+    lines += [f"Warning     {warning}" for warning in summary.warnings]
     if summary.skipped:
-        lines.append(f"\n{summary.skipped} broken frames were skipped, see log.txt")
+        lines.append(f"{summary.skipped} broken frames were skipped, see log.txt")
     if summary.stopped_by:
         name, frames = summary.stopped_by.name, summary.frames
-        lines.append(f"\nStopped by {name} after {frames} frames; all is saved")
+        lines.append(f"Stopped by {name} after {frames} frames; all is saved")
     if summary.resumable:
         lines.append(f"Go on with  bmask-slam run --resume {summary.folder}")
     picture = summary.folder / "trajectory.png"
-    return "\n".join([*lines, f"\nRun folder  {summary.folder}", f"Picture     {picture}"])
+    return "\n".join([*lines, f"Run folder  {summary.folder}", f"Picture     {picture}"])

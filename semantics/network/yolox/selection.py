@@ -71,7 +71,7 @@ def _distributions(probabilities: Tensor, numbers: Tensor, classes: int) -> Tens
     found = probabilities.new_zeros(len(probabilities), classes)
     found[:, numbers[known]] = probabilities[:, known]
     found /= found.sum(dim=1, keepdim=True).clamp(min=1)
-    found[:, 0] = 1 - found.sum(dim=1)
+    found[:, 0] = (1 - found.sum(dim=1)).clamp(min=0)  # not below by rounding
     return found
 
 

@@ -120,6 +120,18 @@ def test_selected_boxes_are_of_the_label_set_clipped_and_best_first() -> None:
     assert found.distributions[0].tolist() == pytest.approx([0.199, 0, 0.8, 0.001])
 
 
+def test_distributions_are_not_negative_by_rounding() -> None:
+    """Scores of classes may add up to more than 1; then nothing is left for the background."""
+    probabilities = torch.rand((500, 80), generator=torch.Generator().manual_seed(4))
+    at = torch.arange(500) * 20.0
+    boxes = torch.stack([at, torch.zeros(500), at + 15, torch.full((500,), 15.0)], dim=1)
+    config = SelectionConfig(max_count=500)
+    found = select(boxes, probabilities, (20, 10_000), read_label_set("coco"), config)
+    assert len(found.distributions) == 500
+    assert (found.distributions >= 0).all()
+    assert torch.allclose(found.distributions.sum(dim=1), torch.ones(500))
+
+
 def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         load_onnx(tmp_path / "none.onnx")
