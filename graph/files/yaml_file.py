@@ -60,7 +60,8 @@ class _Representer(SafeRepresenter):
     def represent_scalar(
         self, tag: Any, value: Any, style: str | None = None, anchor: Any = None
     ) -> ScalarNode:
-        escaped = any(c in value for c in "\x85\u2028\u2029")
+        signs = value.startswith(("?", ":"))  # of a key and a value, within a list
+        escaped = signs or any(c in value for c in "\x85\u2028\u2029")
         return super().represent_scalar(tag, value, '"' if escaped else style, anchor)
 
 
