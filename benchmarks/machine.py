@@ -52,11 +52,15 @@ def brisk_ms(folder: Path) -> float:
 
     With the library's defaults, so that times on different or busy machines can be compared.
     """
-    brisk = cv2.BRISK_create(*YARDSTICK)
+    return features_ms(cv2.BRISK_create(*YARDSTICK), folder)
+
+
+def features_ms(detector: cv2.Feature2D, folder: Path) -> float:
+    """Median time of detection and description on a sequence's first YARDSTICK_FRAMES frames."""
     times_ms = []
     for frame in islice(open_sequence(folder).frames(prefetch=0), YARDSTICK_FRAMES):
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         start_s = time.perf_counter()
-        brisk.detectAndCompute(gray, None)
+        detector.detectAndCompute(gray, None)
         times_ms.append(1e3 * (time.perf_counter() - start_s))
     return float(np.median(times_ms))

@@ -28,14 +28,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from itertools import islice
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from benchmarks.machine import features_ms
 from benchmarks.paths import KITCHEN, ROOT
-from bmask_slam.sequences import open_sequence
 
 NAME = 28
 COLUMNS = (
@@ -52,18 +51,7 @@ COLUMNS = (
     ("latency_ms_p95", "95 %", 1.0),
     ("keyframes", "keyframes", 1.0),
 )
-ORB_KEYPOINTS, ORB_FRAMES = 1000, 40  # ORB-SLAM2's number of keypoints for TUM's sequences
-
-
-def orb_ms(folder: Path) -> float:
-    """Median time of OpenCV's ORB, detection and description, on a sequence's first frames."""
-    orb, times_ms = cv2.ORB_create(ORB_KEYPOINTS), []
-    for frame in islice(open_sequence(folder).frames(prefetch=0), ORB_FRAMES):
-        gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        start_s = time.perf_counter()
-        orb.detectAndCompute(gray, None)
-        times_ms.append(1e3 * (time.perf_counter() - start_s))
-    return float(np.median(times_ms))
+ORB_KEYPOINTS = 1000  # ORB-SLAM2's number of keypoints for TUM's sequences
 
 
 def measured(command: list[str], out: Path, before: Path | None = None) -> dict[str, float]:
@@ -84,7 +72,9 @@ def measured(command: list[str], out: Path, before: Path | None = None) -> dict[
     with (out / "frames.csv").open(encoding="utf-8", newline="") as file:
         frames = sum(1 for _ in csv.DictReader(file))
     found |= {"whole_per_second": frames / wall_s, "cpu_ms": 1e3 * cpu_s / frames}
-    found["per_orb"] = found["tracking_ms_median"] / orb_ms(Path(command[1]))
+    found["per_orb"] = found["tracking_ms_median"] / features_ms(
+        cv2.ORB_create(ORB_KEYPOINTS), Path(command[1])
+    )
     return found
 
 
