@@ -122,20 +122,21 @@ def _depth_edges(depth_m: Array) -> Floats:
     """1/2 on both sides of each jump along the rows (H, W).
 
     Beside a surface in front a structured-light camera has a shadow without depth; it belongs to
-    what is behind, so holes are filled with the larger of the depths at their two ends.
+    what is behind, so a jump over a hole is at the hole's end with the smaller depth.
     """
-    width = depth_m.shape[1]
-    columns, valid = np.arange(width), np.isfinite(depth_m)
-    left = np.maximum.accumulate(np.where(valid, columns, -1), axis=1)
-    right = np.minimum.accumulate(np.where(valid, columns, width)[:, ::-1], axis=1)[:, ::-1]
-    hole = (left >= 0) & (right < width) & (right - left < MAX_HOLE_SHARE * width)
-    ends = [np.take_along_axis(depth_m, np.clip(at, 0, width - 1), 1) for at in (left, right)]
-    filled = np.where(hole, np.maximum(*ends), np.nan)
-    jump = np.abs(np.diff(np.log(filled), axis=1)) > JUMP
-    edges = np.zeros(depth_m.shape, np.float32)
-    edges[:, :-1] += 0.5 * jump
-    edges[:, 1:] += 0.5 * jump
-    return edges
+    height, width = depth_m.shape
+    measured = np.flatnonzero(np.isfinite(depth_m))
+    first, second = measured[:-1], measured[1:]
+    z_m = depth_m.reshape(-1)[measured]
+    nearer, farther = np.minimum(z_m[:-1], z_m[1:]), np.maximum(z_m[:-1], z_m[1:])
+    jumps = np.flatnonzero(farther > np.exp(JUMP) * nearer)
+    first, second, in_front = first[jumps], second[jumps], z_m[jumps] < z_m[jumps + 1]
+    narrow = second - first < MAX_HOLE_SHARE * width
+    left = np.where(in_front, first, second - 1)[narrow & (first // width == second // width)]
+    edges = np.zeros(height * width, np.float32)
+    edges[left] += 0.5
+    edges[left + 1] += 0.5
+    return edges.reshape(height, width)
 
 
 def correlation(edges: EdgeImages, step: int) -> Array:

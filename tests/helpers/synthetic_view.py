@@ -40,16 +40,23 @@ def render_plane(T_world_camera: Array, index: int = 0) -> Frame:
 
     Poses (480, 4, 4) are those of the rows of a rolling shutter.
     """
-    columns, rows = np.meshgrid(np.arange(640.0), np.arange(480.0))
-    pixels = np.stack([columns, rows], axis=-1)
-    rays_camera = CAMERA.backproject(pixels, np.array(1.0))
-    rays_world = rays_camera @ np.swapaxes(T_world_camera[..., :3, :3], -1, -2)
-    z_m = (PLANE_Z_M - T_world_camera[..., 2, 3, None]) / rays_world[..., 2]
-    hits = T_world_camera[..., None, :3, 3] + z_m[..., None] * rays_world
-    texel = ((hits[..., :2] + _TEXTURE_HALF_M) * _TEXELS_PER_M).astype(np.float32)
-    image = cv2.remap(plane_texture(), texel[..., 0], texel[..., 1], cv2.INTER_LINEAR)
-    gray = np.rint(image).astype(np.uint8)
-    return Frame(index, index / 30.0, np.repeat(gray[..., None], 3, axis=2), z_m.astype(np.float32))
+    R, t = T_world_camera[..., :3, :3], T_world_camera[..., :3, 3, None]
+    columns, rows = (
+        (np.arange(640) - CAMERA.cx) / CAMERA.fx,
+        (np.arange(480) - CAMERA.cy) / CAMERA.fy,
+    )
+    x, y, z = (
+        R[..., axis, 0, None] * columns + (R[..., axis, 1] * rows + R[..., axis, 2])[:, None]
+        for axis in range(3)
+    )
+    z_m = (PLANE_Z_M - t[..., 2, :]) / z
+    u, v = (
+        ((t[..., axis, :] + z_m * along + _TEXTURE_HALF_M) * _TEXELS_PER_M).astype(np.float32)
+        for axis, along in enumerate((x, y))
+    )
+    image = cv2.remap(plane_texture(), u, v, cv2.INTER_LINEAR)
+    rgb = cv2.cvtColor(np.rint(image).astype(np.uint8), cv2.COLOR_GRAY2RGB)
+    return Frame(index, index / 30.0, rgb, z_m.astype(np.float32))
 
 
 def render_or_black(T_world_camera: Array | None, index: int) -> Frame:

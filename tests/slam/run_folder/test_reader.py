@@ -31,11 +31,18 @@ def labelled(slow_office: Path, tmp_path_factory: pytest.TempPathFactory) -> Run
     return map_run(found, voxel_m=0.02)
 
 
-@pytest.fixture
-def known(tmp_path: Path) -> Run:
+@pytest.fixture(scope="module")
+def fake_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the fake system; frames 6 and 13 are lost."""
-    options = RunOptions(make_sequence(tmp_path / "seq"), out=tmp_path / "run", quiet=True)
-    return Run(runner.run(options, FakeSystem).folder)
+    folder = tmp_path_factory.mktemp("fake")
+    options = RunOptions(make_sequence(folder / "seq"), out=folder / "run", quiet=True)
+    return runner.run(options, FakeSystem).folder
+
+
+@pytest.fixture
+def known(fake_run: Path, tmp_path: Path) -> Run:
+    """A copy of `fake_run`, which may be changed."""
+    return Run(shutil.copytree(fake_run, tmp_path / "run"))
 
 
 def test_trajectory_and_keyframes_are_those_of_the_system(known: Run) -> None:
@@ -69,10 +76,10 @@ def test_landmarks_without_a_segmenter_have_no_labels(known: Run) -> None:
     assert (landmarks.labels, landmarks.probabilities, landmarks.entropies) == (None, None, None)
 
 
-def test_metrics_origin_and_log(known: Run, tmp_path: Path) -> None:
+def test_metrics_origin_and_log(known: Run, fake_run: Path) -> None:
     assert known.metrics["tracked_share"] == (pytest.approx(0.9), "1")
     assert known.metrics["keyframes"].unit == "keyframes"
-    assert known.sequence == tmp_path / "seq"
+    assert known.sequence == fake_run.with_name("seq")
     assert known.config.tracking.min_inliers > 0
     assert any("camera from" in line for line in known.log)
     assert known.is_finished
