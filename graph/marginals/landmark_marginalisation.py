@@ -153,7 +153,8 @@ class _Marginaliser:
     ) -> None:
         """Make a chunk sparse, keep it, and summarise its landmarks that are out of the graph.
 
-        With ``kept`` relative poses it is sparse already.
+        With ``kept`` relative poses it is sparse already. One that replaces another is made where
+        the graph happens to be: after a loop was closed it may be far from its optimum.
         """
         tables, observations = self.tables, chunk.observations
         marginalised = tables.marginalised
@@ -166,7 +167,8 @@ class _Marginaliser:
             self.config,
         )
         if kept is None:
-            edges = self._tree(poses, observations) if len(keyframes) > 1 else []
+            at_rest = number == marginalised.next_number  # not one that replaces another
+            edges = self._tree(poses, observations, at_rest) if len(keyframes) > 1 else []
             kept = tuple(tables.add_pose_factors(edges))
             self.done.pose_factors += kept
         marginalised.add(replace(chunk, numbers=kept), number)
@@ -175,7 +177,9 @@ class _Marginaliser:
         summaries = make_summaries(observations, left, tables, self.camera)
         marginalised.summaries.update({int(ids[i]): summaries[i] for i in np.flatnonzero(out)})
 
-    def _tree(self, poses: PoseInformation, observations: Observations) -> list[RelativePose]:
+    def _tree(
+        self, poses: PoseInformation, observations: Observations, at_rest: bool
+    ) -> list[RelativePose]:
         """The relative poses that replace these observations; adds keyframes to the bases."""
         marginalised = self.tables.marginalised
         keyframes, row = np.unique(observations.keyframe_ids, return_inverse=True)
@@ -185,7 +189,7 @@ class _Marginaliser:
         is_base = np.isin(keyframes, sorted(marginalised.bases))
         is_base = with_new_bases(sees @ sees.T, is_base, self.config.base_share)
         marginalised.bases.update(keyframes[is_base].tolist())
-        return recover(poses, spanning_tree(poses, is_base), MARGINAL)
+        return recover(poses, spanning_tree(poses, is_base), MARGINAL, at_rest)
 
     def without_leaves(self, number: int, culled: list[int]) -> tuple[int, ...] | None:
         """A chunk's relative poses without those of keyframes that end a branch of its tree.

@@ -35,12 +35,19 @@ _LEAST = 1.0
 """Information (rad^-2, m^-2) that makes every covariance finite; an edge with less is omitted."""
 
 
-def recover(information: PoseInformation, edges: Ints, kind: str) -> list[RelativePose]:
+def recover(
+    information: PoseInformation, edges: Ints, kind: str, at_rest: bool = True
+) -> list[RelativePose]:
     """Relative poses on a tree (E, 2) of rows that replace the dense information.
 
-    Their gradient at the linearisation point is that of the dense cost, so that a graph at its
-    optimum stays there when these replace the observations; but no measurement differs from the
-    current relative pose by more than ``_FAR`` times ``_KNOWN_SIGMAS``.
+    At rest, that is at the optimum of the whole graph, their gradient at the linearisation point is
+    that of the dense cost, so that the graph stays there when these replace the observations. The
+    tree is less stiff than the dense information; so away from an optimum the same gradient would
+    carry it far beyond that of the dense cost, and farther each time that it is made again. There
+    the relative poses are those of the dense Gaussian's mean, as the least divergence asks for.
+
+    No measurement differs from the current relative pose by more than ``_FAR`` times
+    ``_KNOWN_SIGMAS``.
     """
     count, poses = len(information.keyframe_ids), information.poses_world_camera
     anchor, covariance = _anchored(information)
@@ -48,14 +55,12 @@ def recover(information: PoseInformation, edges: Ints, kind: str) -> list[Relati
     X = np.linalg.inv(_relative(covariance, poses, a, b))
     X -= np.linalg.inv(_relative(_known(count, anchor), poses, a, b))
     X = (X + np.swapaxes(X, 1, 2)) / 2 + _LEAST * np.eye(6)
-    blocks = np.zeros((len(edges), 6, count, 6))
-    blocks[np.arange(len(edges)), :, a] = _jacobians(poses, a, b)
-    blocks[np.arange(len(edges)), :, b] = np.eye(6)
-    J = np.delete(blocks, anchor, axis=2).reshape(len(edges), 6, 6 * (count - 1))
-    H = np.einsum("eik,eij,ejl->kl", J, X, J, optimize=True)
-    H += np.diag(np.tile(_KNOWN_SIGMAS**-2, count - 1))
-    xi = -np.linalg.solve(H, np.delete(information.g, anchor, axis=0).ravel())
-    moves = J @ xi
+    J_a = _jacobians(poses, a, b)
+    if at_rest:
+        xi = _tree_step(X, J_a, edges, information.g, anchor)
+    else:
+        xi = -np.einsum("kilj,lj->ki", covariance, information.g)
+    moves = (J_a @ xi[a, :, None])[..., 0] + xi[b]
     moves /= np.maximum(1.0, np.linalg.norm(moves / _KNOWN_SIGMAS, axis=1) / _FAR)[:, None]
     T_a_b = inverse(poses[a]) @ poses[b] @ se3_exp(moves)
     covariances = np.linalg.inv(X)
@@ -66,6 +71,19 @@ def recover(information: PoseInformation, edges: Ints, kind: str) -> list[Relati
         RelativePose(ends[e][0], ends[e][1], T_a_b[e], covariances[e], kind=kind)
         for e in np.flatnonzero(useful).tolist()
     ]
+
+
+def _tree_step(X: Array, J_a: Array, edges: Ints, g: Array, anchor: int) -> Array:
+    """Tangents (K, 6) of the minimum of a tree of information X (E, 6, 6) with the gradient g."""
+    count = len(g)
+    J = np.zeros((len(edges), 6, count, 6))
+    J[np.arange(len(edges)), :, edges[:, 0]] = J_a
+    J[np.arange(len(edges)), :, edges[:, 1]] = np.eye(6)
+    J = np.delete(J, anchor, axis=2).reshape(len(edges), 6, 6 * (count - 1))
+    H = np.einsum("eik,eij,ejl->kl", J, X, J, optimize=True)
+    H += np.diag(np.tile(_KNOWN_SIGMAS**-2, count - 1))
+    xi = -np.linalg.solve(H, np.delete(g, anchor, axis=0).ravel()).reshape(-1, 6)
+    return np.insert(xi, anchor, 0.0, axis=0)
 
 
 def spanning_tree(information: PoseInformation, is_base: Mask) -> Ints:

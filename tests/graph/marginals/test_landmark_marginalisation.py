@@ -221,6 +221,24 @@ def test_a_removed_observation_is_removed_from_its_group() -> None:
     assert np.abs(pose_differences(after, expected)).max() < 0.3 * off
 
 
+def test_a_group_that_is_renewed_away_from_its_optimum_leads_back() -> None:
+    """A graph that has not come to rest must not be carried farther by each removal."""
+    smoother = filled(make_room(keyframes=10, points=150, noise_px=0.5, seed=4))
+    smoother.optimise_batch()
+    ids = smoother.tables.landmarks.ids
+    at_rest = marginalise_landmarks(smoother, ids)
+    moved = at_rest.poses_world_camera @ se3_exp(
+        0.003 * np.random.default_rng(0).normal(size=(10, 6))
+    )
+    smoother.tables.keyframes.values = np.concatenate([at_rest.poses_world_camera[:1], moved[1:]])
+    offs_m = [np.abs(pose_differences(at_rest, smoother.estimate()))[:, 3:].max()]
+    for landmark in ids[:8]:
+        smoother.restart()
+        after = smoother.update(GraphUpdate(remove_landmarks=np.array([landmark])))
+        offs_m.append(np.abs(pose_differences(at_rest, after))[:, 3:].max())
+    assert max(offs_m[1:]) < 0.5 * offs_m[0]
+
+
 def test_a_culled_leaf_leaves_what_is_known_of_the_others() -> None:
     """All that its observations say of other keyframes stays, in theirs and in the tree."""
     smoother = filled()
