@@ -9,6 +9,9 @@ from types import ModuleType
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import in_short
 
+DENSE_LIBRARIES = ("torch", "numba")
+"""What a dense map needs, in the order in which it is asked for."""
+
 
 def import_extra(name: str, needed_by: str, extra: str, instead: str = "") -> ModuleType:
     """A module of a library that the pip extra ``extra`` installs.

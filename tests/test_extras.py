@@ -14,6 +14,7 @@ from bmask_slam.graph.extras import import_extra
 
 LIBRARIES = (
     "torch",
+    "numba",
     "open3d",
     "safetensors",
     "libusb_package",

@@ -76,7 +76,7 @@ def recover(
 def _tree_step(X: Array, J_a: Array, edges: Ints, g: Array, anchor: int) -> Array:
     """Tangents (K, 6) of the minimum of a tree of information X (E, 6, 6) with the gradient g."""
     count = len(g)
-    J = np.zeros((len(edges), 6, count, 6))
+    J: Array = np.zeros((len(edges), 6, count, 6))
     J[np.arange(len(edges)), :, edges[:, 0]] = J_a
     J[np.arange(len(edges)), :, edges[:, 1]] = np.eye(6)
     J = np.delete(J, anchor, axis=2).reshape(len(edges), 6, 6 * (count - 1))

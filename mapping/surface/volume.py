@@ -26,15 +26,14 @@ from bmask_slam.mapping.surface.blocks import (
 from bmask_slam.mapping.surface.depth_frame import (
     BEHIND,
     NX,
-    NY,
     NZ,
     OFFSET,
     WEIGHT,
-    WITNESS,
     DepthFrame,
     Z,
     gains,
 )
+from bmask_slam.mapping.surface.kernel import HALVES, NEAREST_M, add_frame
 
 FRONT_VOXELS = 8
 """Distances in front of a surface are cut off at so many voxels."""
@@ -42,9 +41,7 @@ COLOUR_VOXELS = 2.0
 """Voxels this near to a surface take its colour, and count the frame as a witness of it."""
 FREE_SHARE = 0.02
 """A ray passes a voxel freely if the surface is farther by the cut-off and this share of depth."""
-AT_ONCE, MAX_RAY_STEP_PX, NEAREST_M = 1024, 4, 0.1
-HALF_MAX = 6e4
-"""Weights of colours are cut off here, below the largest float16."""
+MAX_RAY_STEP_PX = 4
 SAMPLES = 4800
 """About so many pixels tell about a frame's exposure."""
 RELEASE_FRAMES = 32
@@ -131,8 +128,7 @@ class SurfaceVolume:
         bricks = self._seen(frame, T_camera_world)
         if only is not None:
             bricks = bricks[only.index_select(0, bricks // BRICKS)]
-        for start in range(0, len(bricks), AT_ONCE):
-            self._update(bricks[start : start + AT_ONCE], frame, T_camera_world)
+        self._update(bricks, frame, T_camera_world)
         self._frames += 1
         if self._frames % RELEASE_FRAMES == 0:
             self.release()
@@ -239,59 +235,16 @@ class SurfaceVolume:
     def _update(self, bricks: Tensor, frame: DepthFrame, T_camera_world: Tensor) -> None:
         """Add what the frame tells about the voxels of bricks (N,)."""
         R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
-        corners = self._origin[bricks // BRICKS] + self._bricks[bricks % BRICKS]
-        corners, offsets = corners @ R.T + t, self._voxels @ R.T
-        x, y, z = ((corners[:, k, None] + offsets[:, k]).reshape(-1) for k in range(3))
-        camera = self._camera
-        u = (x / z).mul_(camera.fx).add_(camera.cx).round_()
-        v = (y / z).mul_(camera.fy).add_(camera.cy).round_()
-        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (z > NEAREST_M)
-        pixel = v.mul_(camera.width).add_(u).nan_to_num_().clamp_(0, len(frame.free_m) - 1)
-        pixel = pixel.to(torch.int32)
-        planes = frame.pixels.index_select(0, pixel)
-        d = (planes[:, NX] * x).addcmul_(planes[:, NY], y).addcmul_(planes[:, NZ], z)
-        d -= planes[:, OFFSET]
-        behind, front = planes[:, BEHIND], FRONT_VOXELS * self.voxel_m
-        first = (bricks * BRICK_VOXELS)[:, None] + torch.arange(BRICK_VOXELS)
-        free_m = frame.free_m.index_select(0, pixel).mul_(1 - FREE_SHARE).sub_(front)
-        _add(self.free, first.reshape(-1)[inside & (z < free_m)], 1)
-        measured = inside & (d > -behind) & (planes[:, WEIGHT] > 0)
-        measured &= z < planes[:, Z] + 2 * behind
-        used = torch.nonzero(measured)[:, 0]
-        voxels, d = first.reshape(-1).index_select(0, used), d.index_select(0, used)
-        weight, behind = (planes[:, k].index_select(0, used) for k in (WEIGHT, BEHIND))
-        self._average(voxels, d.clamp_(max=front), weight, behind)
-        near = torch.nonzero(d.abs() < COLOUR_VOXELS * self.voxel_m)[:, 0]
-        used, voxels, weight = (a.index_select(0, near) for a in (used, voxels, weight))
-        _add(self.witnesses, voxels, planes[:, WITNESS].index_select(0, used).to(torch.float16))
-        self._paint(voxels, frame.paint.index_select(0, pixel.index_select(0, used)), weight)
-
-    def _paint(self, voxels: Tensor, paint: Tensor, weight: Tensor) -> None:
-        """Add colours (N, 4) with weights (N,) to the means of voxels (N,), all different ones."""
-        colour = self.colour.view(-1, 4)
-        old = colour.index_select(0, voxels).to(torch.float32)
-        added = weight * paint[:, 3]
-        total = old[:, 3] + added
-        new = old + (added / total)[:, None] * (paint - old)
-        new[:, 3] = total.clamp_(max=HALF_MAX)
-        colour.index_copy_(0, voxels, new.to(torch.float16))
-
-    def _average(self, voxels: Tensor, d: Tensor, added: Tensor, behind: Tensor) -> None:
-        """Add distances (N,) with weights (N,) to the means of voxels (N,), all different ones.
-
-        Up to a voxel behind the surface they count fully, then less and less: what is behind a thin
-        wall is its other side.
-        """
-        fall = ((d + behind) / (behind - self.voxel_m)).clamp_(max=1)
-        weight, distance = self.weight.view(-1), self.distance.view(-1)
-        added = added * fall
-        total = weight.index_select(0, voxels) + added
-        old = distance.index_select(0, voxels)
-        distance.index_copy_(0, voxels, old + added / total * (d - old))
-        weight.index_copy_(0, voxels, total)
-
-
-def _add(table: Tensor, rows: Tensor, values: Tensor | int) -> None:
-    """Add values to rows (N,), all different, of a table, seen as one column."""
-    column = table.view(-1)
-    column.index_copy_(0, rows, column.index_select(0, rows) + values)
+        corners = (self._origin[bricks // BRICKS] + self._bricks[bricks % BRICKS]) @ R.T + t
+        camera, voxel_m = self._camera, self.voxel_m
+        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+        reach = (voxel_m, FRONT_VOXELS * voxel_m, COLOUR_VOXELS * voxel_m, 1 - FREE_SHARE)
+        bits = (t.numpy().view(np.uint16) for t in (self.witnesses, self.free, self.colour))
+        add_frame(
+            bricks.numpy(),
+            (corners.numpy(), (self._voxels @ R.T).numpy()),
+            (*map(np.float32, intrinsics), camera.width, camera.height),
+            (frame.pixels.numpy(), frame.free_m.numpy(), frame.paint.numpy()),
+            tuple(map(np.float32, reach)),
+            (self.distance.numpy(), self.weight.numpy(), *bits, HALVES),
+        )

@@ -12,6 +12,7 @@ from bmask_slam.semantics.network.backbone.layers import (
     ConvBlock,
     NormKind,
     conv_stack,
+    draw_normal,
     keep_variance,
 )
 from bmask_slam.semantics.network.config import NetworkConfig
@@ -38,7 +39,7 @@ class MaskPredictor(nn.Module):
         self.conv5_mask = nn.ConvTranspose2d(channels, channels, 2, 2)
         self.mask_fcn_logits = nn.Conv2d(channels, outputs, 1)
         keep_variance(self)
-        nn.init.normal_(self.mask_fcn_logits.weight, std=OUTPUT_STD)
+        draw_normal(self.mask_fcn_logits.weight, OUTPUT_STD)
 
     def forward(self, x: Tensor) -> Tensor:
         """(R, channels, 14, 14) to logits (R, outputs, 28, 28)."""
@@ -63,7 +64,7 @@ class MaskIoUHead(nn.Module):
         self.maskiou_fc2 = nn.Linear(hidden, hidden)
         self.maskiou = nn.Linear(hidden, config.mask_outputs)
         keep_variance(self)
-        nn.init.normal_(self.maskiou.weight, std=OUTPUT_STD)
+        draw_normal(self.maskiou.weight, OUTPUT_STD)
 
     def forward(self, features: Tensor, masks: Tensor) -> Tensor:
         """IoUs (R, outputs) of mask probabilities (R, 28, 28) with features (R, C, 14, 14)."""

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from bmask_slam.semantics.network import boxes as box_ops
 from bmask_slam.semantics.network.anchors import make_anchors
-from bmask_slam.semantics.network.backbone.layers import conv_stack
+from bmask_slam.semantics.network.backbone.layers import conv_stack, draw_normal
 from bmask_slam.semantics.network.config import NetworkConfig, ProposalConfig
 from bmask_slam.semantics.network.images import ImageBatch
 from bmask_slam.semantics.network.nms import grouped_nms
@@ -27,7 +27,7 @@ class RPNHead(nn.Module):
         self.bbox_pred = nn.Conv2d(channels, 4 * anchors, 1)
         for conv in self.modules():
             if isinstance(conv, nn.Conv2d):
-                nn.init.normal_(conv.weight, std=0.01)
+                draw_normal(conv.weight, 0.01)
 
     def forward(self, levels: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """Logits (B, A_l) and offsets (B, A_l, 4) of each level, in the anchors' order."""

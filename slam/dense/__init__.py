@@ -1,5 +1,6 @@
 """Dense mapping of a run: input, fusion of keyframes, folder of submaps, products."""
 
-from bmask_slam.graph.extras import import_extra
+from bmask_slam.graph.extras import DENSE_LIBRARIES, import_extra
 
-import_extra("torch", "a dense map", "dense")
+for library in DENSE_LIBRARIES:
+    import_extra(library, "a dense map", "dense")

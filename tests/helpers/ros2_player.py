@@ -39,7 +39,7 @@ T_BASE_CAMERA = make_pose(
 )
 T_ODOM_MAP = se3_exp(np.array([0, 0, 0.7, 3.0, -2.0, 0]))
 BEGIN_S = 1000.0
-LONGEST_S = 120.0
+LONGEST_S = 400.0
 PLACES, WAITING = 10, 300
 
 

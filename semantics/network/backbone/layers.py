@@ -84,12 +84,24 @@ class ConvBlock(nn.Sequential):
 
 
 def keep_variance(module: nn.Module) -> None:
-    """Initialise all weights inside so that ReLU layers keep the variance (He et al. 2015)."""
+    """Initialise all weights inside so that ReLU layers keep the variance (He et al. 2015).
+
+    Not those on the meta device, see ``draw_normal``.
+    """
     for part in module.modules():
-        if isinstance(part, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
+        if isinstance(part, nn.Conv2d | nn.ConvTranspose2d | nn.Linear) and not part.weight.is_meta:
             nn.init.kaiming_normal_(part.weight, nonlinearity="relu")
             if part.bias is not None:
                 nn.init.zeros_(part.bias)
+
+
+def draw_normal(weight: Tensor, std: float) -> None:
+    """Initialise weights by a normal distribution, but for those on the meta device.
+
+    These have no values, and to draw some torch would load its compiler: 0.7 s and 60 MB.
+    """
+    if not weight.is_meta:
+        nn.init.normal_(weight, std=std)
 
 
 def conv_stack(channels: int, width: int, count: int, norm: NormKind) -> list[ConvBlock]:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from bmask_slam.semantics.network.backbone.layers import conv_stack, keep_variance
+from bmask_slam.semantics.network.backbone.layers import conv_stack, draw_normal, keep_variance
 from bmask_slam.semantics.network.boxes import enlarged
 from bmask_slam.semantics.network.mask_heads import BINS, OUTPUT_STD, expected_iou
 from bmask_slam.semantics.network.roi_align import feature_table, roi_align
@@ -44,7 +44,7 @@ class MaskHead(nn.Module):
         self.fine = nn.Sequential(*conv_stack(FINE_WIDTH, FINE_WIDTH, 1, "none"))
         self.logits = nn.Conv2d(FINE_WIDTH, 1, 1)
         keep_variance(self)
-        nn.init.normal_(self.logits.weight, std=OUTPUT_STD)
+        draw_normal(self.logits.weight, OUTPUT_STD)
 
     def forward(self, features: Tensor, edges: Tensor) -> Tensor:
         """Logits (R, 28, 28) from (R, 64, 14, 14) and (R, 48, 28, 28)."""
@@ -65,7 +65,7 @@ class QualityHead(nn.Module):
         self.hidden = nn.Linear(IOU_WIDTH * (BINS // 2) ** 2 + 1, IOU_HIDDEN)
         self.correction = nn.Linear(IOU_HIDDEN, 1)
         keep_variance(self)
-        nn.init.normal_(self.correction.weight, std=OUTPUT_STD)
+        draw_normal(self.correction.weight, OUTPUT_STD)
 
     def forward(self, features: Tensor, masks: Tensor) -> Tensor:
         """IoUs (R,) with the whole object of masks (R, 28, 28) with features (R, 64, 14, 14)."""

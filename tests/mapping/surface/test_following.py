@@ -194,7 +194,7 @@ def test_colours_are_found_where_they_are() -> None:
     volume = SurfaceVolume(VOXEL_M, CAMERA)
     volume.integrate(seen_from(0, TRUE[0]))
     volume.colour[...] = 0
-    bricks, voxels = torch.nonzero(volume.weight > 0)[::97].unbind(-1)
+    bricks, voxels = torch.nonzero(volume.weight[:, :1] > 0).unbind(-1)  # one in each brick
     volume.colour[bricks, voxels] = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float16)
     places = volume._origin[bricks // 8] + volume._bricks[bricks % 8] + volume._voxels[voxels]
     assert (volume.colours_at(places) == torch.tensor([1.0, 2.0, 3.0, 4.0])).all()

@@ -119,6 +119,7 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
             "--quiet",
             "--silence",
             "300",
+            "--reliable",  # on a full machine of best effort hardly an image is whole
         )
         code = main(["live", f"ros2:{DOMAIN}", "--out", str(out), "--max-frames", str(FRAMES - 2),
                      *options])  # fmt: skip
