@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 
-from ros2_player import BEGIN_S, T_BASE_CAMERA, T_ODOM_MAP, example_message, pose
+from ros2_player import BEGIN_S, T_BASE_CAMERA, T_ODOM_MAP, example_message, info, pose
 
 from bmask_slam.cli import main
 from bmask_slam.config.configuration import resolve
@@ -26,10 +27,10 @@ from bmask_slam.graph.geometry import (
     se3_log,
 )
 from bmask_slam.graph.sensors.mounting import T_of
-from bmask_slam.live.ros2.dds import carried_type, dds_name, ros_name
+from bmask_slam.live.ros2.dds import DdsNode, carried_type, dds_name, ros_name
 from bmask_slam.live.ros2.messages import ros_covariance
 from bmask_slam.live.ros2.outputs import OPTICAL, Ros2Frames
-from bmask_slam.live.ros2.transport import typestore
+from bmask_slam.live.ros2.transport import SENSOR, STATE, Quality, typestore
 from bmask_slam.live.sources.opening import SourceOptions, open_source
 from bmask_slam.system_config import SystemConfig
 
@@ -99,6 +100,21 @@ def test_frames_are_checked() -> None:
 def test_other_domains_are_refused(text: str) -> None:
     with pytest.raises(InputError, match="domain"):
         open_source(text, SourceOptions(silence_s=0.1))
+
+
+@pytest.mark.parametrize("sent", [SENSOR, STATE], ids=["best effort", "reliable"])
+def test_images_are_taken_of_best_effort_as_ros_sends_them(sent: Quality, monkeypatch) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    camera, listener = DdsNode(DOMAIN + 2), DdsNode(DOMAIN + 2)
+    writer = camera.writer("/camera_info", "sensor_msgs/msg/CameraInfo", sent)
+    reader = listener.reader("/camera_info", "sensor_msgs/msg/CameraInfo")
+    end_s, heard = time.monotonic() + 60, []
+    while not heard and time.monotonic() < end_s:  # what was sent before both knew it is lost
+        writer.send(info(12.5))
+        time.sleep(0.02)
+        heard = list(reader.take())
+    assert heard[0].width == 640
+    assert heard[0].header.stamp.sec == 12
 
 
 def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypatch) -> None:
