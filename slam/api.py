@@ -48,6 +48,7 @@ class MapKeywords(TypedDict, total=False):
     mesh_voxel_m: float
     source: str
     device: str
+    pcd: bool
     keep_volume: bool
     quiet: bool
 

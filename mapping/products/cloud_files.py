@@ -1,4 +1,4 @@
-"""Point clouds written block by block as PLY and PCD: whole or not at all."""
+"""Point clouds written block by block as PLY, and PCD if asked for: whole or not at all."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Bytes
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.whole_file import remove, whole_file
 from bmask_slam.mapping.products.cloud import Cloud
 
 _PLY_NAMES = {"<f4": "float", "|u1": "uchar", "<u2": "ushort"}
@@ -22,7 +22,7 @@ _PACKED = ("blue", "green", "red", "alpha")
 
 
 class CloudWriter:
-    """Writes blocks of a cloud as binary PLY and PCD.
+    """Writes blocks of a cloud as binary PLY, and as PCD, the files of ROS and PCL.
 
     A context manager: the files appear under their names only if its block ends without an error.
 
@@ -30,13 +30,13 @@ class CloudWriter:
         count: points written so far.
     """
 
-    def __init__(self, stem: Path, palette: Bytes | None = None) -> None:
+    def __init__(self, stem: Path, palette: Bytes | None = None, pcd: bool = False) -> None:
         """``stem`` is the path without suffix; with a ``palette`` (C, 3) points have the colours of
-        their labels.
+        their labels. Without ``pcd`` there is no such file, nor an old one of this name.
         """
         self.stem = stem
         self.count = 0
-        self._palette = palette
+        self._palette, self._pcd = palette, pcd
         self._body: IO[bytes] | None = None
 
     def __enter__(self) -> CloudWriter:
@@ -54,7 +54,9 @@ class CloudWriter:
         with self._body as body:
             if error is None:
                 self._finish(body, ".ply", _ply_header(self.count))
-                self._finish(body, ".pcd", _pcd_header(self.count))
+                remove(self.stem.with_suffix(".pcd"))
+                if self._pcd:
+                    self._finish(body, ".pcd", _pcd_header(self.count))
 
     def _finish(self, body: IO[bytes], suffix: str, header: str) -> None:
         path = self.stem.with_suffix(suffix)

@@ -48,11 +48,11 @@ def assign_regions(cloud: Cloud, regions: Sequence[ObjectRegion]) -> Ints:
 
 
 class ObjectClouds(ExitStack):
-    """Writes FOLDER/NAME.ply and .pcd for every region with points; a context manager."""
+    """Writes FOLDER/NAME.ply, and .pcd, for every region with points; a context manager."""
 
-    def __init__(self, folder: Path, regions: Sequence[ObjectRegion]) -> None:
+    def __init__(self, folder: Path, regions: Sequence[ObjectRegion], pcd: bool = False) -> None:
         super().__init__()
-        self.folder, self.regions = folder, regions
+        self.folder, self.regions, self._pcd = folder, regions, pcd
         self._writers: dict[int, CloudWriter] = {}
 
     def __enter__(self) -> Self:
@@ -65,7 +65,7 @@ class ObjectClouds(ExitStack):
         for k in np.unique(found[found >= 0]).tolist():
             if k not in self._writers:
                 self.folder.mkdir(exist_ok=True)
-                writer = CloudWriter(self.folder / self.regions[k].name)
+                writer = CloudWriter(self.folder / self.regions[k].name, pcd=self._pcd)
                 self._writers[k] = self.enter_context(writer)
             self._writers[k].write(cloud.select(found == k))
 

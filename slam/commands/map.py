@@ -45,6 +45,7 @@ def add_map(commands: Commands) -> None:
     add_mesh_voxel_argument(parser)
     parser.add_argument("--mesh", action="store_true", help="also a mesh (mesh.ply, mesh.glb)")
     parser.add_argument("--plan", action="store_true", help="also a floor plan (plan.png)")
+    parser.add_argument("--pcd", action="store_true", help="clouds as PCD beside PLY")
     add_segmenter_arguments(parser, "the run's own")
     parser.add_argument(
         "--without", metavar="A,B", help="classes left out (default: people and animals)"
@@ -88,6 +89,7 @@ def _map(arguments: argparse.Namespace) -> int:
         device=arguments.device,
         mesh=arguments.mesh,
         plan=arguments.plan,
+        pcd=arguments.pcd,
         keep_volume=arguments.keep_volume,
     )
     with counting_bar(arguments.quiet) as progress:

@@ -6,8 +6,9 @@ depth/ID            fused inverse depth and its sigma, quantised
 colours/ID.jpg      its undistorted colours
 labels/ID           log likelihoods of its instances, one row each, landmarks on them, and
                     the instance of each pixel; written last: a keyframe that has it is finished
-cloud.ply, .pcd     the cloud, with normals, label, probability and sigma of each point
-semantic.ply, .pcd  the same in the colours of the labels, if there are labels
+cloud.ply           the cloud, with normals, label, probability and sigma of each point
+semantic.ply        the same in the colours of the labels, if there are labels
+*.pcd               with --pcd: the same clouds for ROS and PCL
 objects/ID-CLASS    a cloud of each object of the run
 moving/ID, .ply     with --moving: excluded points of each keyframe, and the cloud of all of them
 frames/             while `live --map` runs: frames between keyframes, for the growing surface

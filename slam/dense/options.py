@@ -37,6 +37,7 @@ class MapOptions:
         source: where depth comes from, see `mapping.inverse_depth.dense_mapper.DenseConfig`.
         device: torch's name of the device that computes the fusion.
         mesh, plan: whether to make them.
+        pcd: write clouds as PCD too.
         keep_volume: keep the surface's volume, so that the next map only integrates what moved.
     """
 
@@ -51,6 +52,7 @@ class MapOptions:
     device: str = "cpu"
     mesh: bool = False
     plan: bool = False
+    pcd: bool = False
     keep_volume: bool = False
 
     @property

@@ -193,7 +193,7 @@ def _pieces(count: int) -> Iterator[slice]:
 
 def _write_clouds(fused: FusedMap, cloud: Cloud, names: tuple[str, ...]) -> list[Path]:
     """Write the cloud, that in the colours of the labels if there are some, and the objects'."""
-    path, colours = fused.folder.path, palette(names)
+    path, colours, pcd = fused.folder.path, palette(names), fused.options.pcd
     legend = dict(zip(names, colours.tolist(), strict=True))
     fused.folder.write_text("legend.json", json.dumps(legend, indent=1) + "\n")
     for suffix in (".ply", ".pcd"):
@@ -202,11 +202,11 @@ def _write_clouds(fused: FusedMap, cloud: Cloud, names: tuple[str, ...]) -> list
     for name, palette_of in (("cloud", None), ("semantic", colours))[
         : 1 + bool(cloud.labels.any())
     ]:
-        with CloudWriter(path / name, palette_of) as file:
+        with CloudWriter(path / name, palette_of, pcd) as file:
             for some in _pieces(len(cloud)):
                 file.write(cloud.select(some))
-        written += [path / f"{name}.ply", path / f"{name}.pcd"]
-    with ObjectClouds(path / "objects", _regions(fused)) as objects:
+        written += [path / f"{name}{suffix}" for suffix in (".ply", ".pcd")[: 1 + pcd]]
+    with ObjectClouds(path / "objects", _regions(fused), pcd) as objects:
         objects.write(cloud)
     return written + objects.files
 
@@ -218,7 +218,7 @@ def _write_excluded(fused: FusedMap, evidence: KeyframeEvidence, table: LabelTab
     saved = [(k, fused.folder.excluded(k.id)) for k in evidence.keyframes]
     if not any(submap for _, submap in saved):
         return []
-    with CloudWriter(path) as file:
+    with CloudWriter(path, pcd=fused.options.pcd) as file:
         for (keyframe, submap), first in zip(saved, evidence.first, strict=False):
             if submap is None:
                 continue

@@ -90,7 +90,7 @@ def test_objects_in_several_views_are_kept_and_in_one_view_dropped() -> None:
 
 def test_files_are_read_back(tmp_path: Path) -> None:
     first, second = cloud(), cloud(30)
-    with CloudWriter(tmp_path / "cloud") as writer:
+    with CloudWriter(tmp_path / "cloud", pcd=True) as writer:
         writer.write(first)
         writer.write(second)
     columns = read_ply(tmp_path / "cloud.ply")
@@ -105,6 +105,14 @@ def test_files_are_read_back(tmp_path: Path) -> None:
             255 * np.asarray(read.colors)[: len(first)], first.colours, atol=0.5
         )
         np.testing.assert_allclose(np.asarray(read.normals)[: len(first)], first.normals, atol=1e-6)
+
+
+def test_without_pcd_an_old_one_does_not_stay(tmp_path: Path) -> None:
+    for pcd in (True, False):
+        with CloudWriter(tmp_path / "cloud", pcd=pcd) as writer:
+            writer.write(cloud())
+        assert (tmp_path / "cloud.pcd").exists() is pcd
+        assert (tmp_path / "cloud.ply").exists()
 
 
 def test_a_failure_leaves_no_file(tmp_path: Path) -> None:

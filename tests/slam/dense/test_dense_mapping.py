@@ -56,6 +56,7 @@ def room(rendered) -> Path:
 def mapped(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = make_run(tmp_path_factory.mktemp("runs") / "office", open_sequence(room))
     arguments = ["map", str(run), "--voxel", "0.02", "--segmenter", "truth", "--plan", "--mesh"]
+    arguments += ["--pcd"]
     assert main([*arguments, "--quiet"]) == 0
     return run
 
@@ -66,6 +67,7 @@ def test_the_products_are_written(mapped: Path) -> None:
         "cloud.ply",
         "cloud.pcd",
         "semantic.ply",
+        "semantic.pcd",
         "mesh.ply",
         "mesh.glb",
         "plan.png",
