@@ -39,8 +39,9 @@ from bmask_slam.sequences.frame import Frame
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.002
-EXPECTED_S = 2.0
-"""Time in which a topic that has a publisher gives a message, before the camera is known."""
+EXPECTED_SHARE = 0.2
+"""Of the time that is waited for frames: in so much a topic that has a publisher gives a message,
+before the camera is known."""
 SENSORS_S = 0.1
 """Longest time that measurements wait for an image to be handed on with."""
 
@@ -48,9 +49,10 @@ SENSORS_S = 0.1
 class _Heard:
     """What is heard on a domain, as ``topics`` reads a bag: topics, and first messages."""
 
-    def __init__(self, node: Node, name: str) -> None:
+    def __init__(self, node: Node, name: str, options: Ros2Options) -> None:
         self.path = Path(name)
-        self._node = node
+        self._node, self.expected_s = node, EXPECTED_SHARE * options.silence_s
+        self._images = STATE if options.reliable else SENSOR
         self._readers: dict[str, list[Reader]] = {}
         self._messages: dict[str, list[Any]] = {}
 
@@ -74,11 +76,11 @@ class _Heard:
         if name not in self._readers:
             quality = LATCHED._replace(depth=100)
             both = {TRANSFORMS: (quality,), INFO_TYPE: (SENSOR, quality)}  # some send it once
-            chosen = both.get(name) or both.get(kind, (SENSOR,))
+            chosen = both.get(name) or both.get(kind, (self._images,))
             self._readers[name] = [self._node.reader(name, kind, q) for q in chosen]
         kept = self._messages.setdefault(name, [])
         kept += self._taken(name) if name == TRANSFORMS else ()
-        end_s = time.monotonic() + EXPECTED_S
+        end_s = time.monotonic() + self.expected_s
         while not kept and time.monotonic() < end_s:
             kept += self._taken(name)
             time.sleep(POLL_S)
@@ -138,7 +140,7 @@ class Ros2Source(MeasuredSource):
         self._silence_s = options.silence_s
         self._closed, self._played = threading.Event(), 0
         self._where = name
-        self._heard = _Heard(self.node, self._where)
+        self._heard = _Heard(self.node, self._where, options)
         heard = cast("Bag", self._heard)
         self._topics = self._wait_for_topics(heard, options.topics)
         self.camera, self._form = find_camera(heard, self._topics, options.camera)
@@ -166,7 +168,7 @@ class Ros2Source(MeasuredSource):
         """T_camera_frame (4, 4) of the colour camera by /tf_static; None where it does not say."""
         if self._frame == frame.lstrip("/"):
             return np.eye(4)
-        end_s, heard = time.monotonic() + EXPECTED_S, cast("Bag", self._heard)
+        end_s, heard = time.monotonic() + self._heard.expected_s, cast("Bag", self._heard)
         while True:
             T = static_extrinsics(heard, self._frame, frame)
             if T is not None or time.monotonic() > end_s:
