@@ -47,8 +47,7 @@ LOOPBACK = """<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterfac
 multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast></General><Discovery>
 <ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>20</MaxAutoParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
-DOMAIN, FRAMES = 77, 40
-"""The first frames may be through before the player has found who publishes their poses."""
+DOMAIN, FRAMES = 77, 10
 
 
 @pytest.mark.parametrize("name", TYPES)
@@ -122,7 +121,7 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
     helpers = Path(__file__).parents[3] / "helpers"
     path = os.pathsep.join([str(helpers), *filter(None, sys.path)])
-    words = [sys.executable, helpers / "ros2_player.py", DOMAIN, 20, tmp_path / "heard"]
+    words = [sys.executable, helpers / "ros2_player.py", DOMAIN, 10, tmp_path / "heard"]
     env = {**os.environ, "PYTHONPATH": path}
     with subprocess.Popen(list(map(str, words)), env=env, stdin=subprocess.PIPE) as player:
         out = tmp_path / "run"
@@ -136,15 +135,14 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
             "--quiet",
             "--silence",
             "300",
-            "--reliable",  # on a full machine of best effort hardly an image is whole
         )
-        code = main(["live", f"ros2:{DOMAIN}", "--out", str(out), "--max-frames", str(FRAMES),
+        code = main(["live", f"ros2:{DOMAIN}", "--out", str(out), "--max-frames", str(FRAMES - 2),
                      *options])  # fmt: skip
         player.communicate(timeout=60)
         assert (code, player.returncode) == (0, 0)
     heard = json.loads((tmp_path / "heard").read_text())
     odometry = heard["/bmask_slam/odometry"]
-    assert len(odometry) >= FRAMES / 4
+    assert len(odometry) >= FRAMES - 4  # of best effort
     assert {(o["frame"], o["child"]) for o in odometry} == {("map", "base_link")}
     for one in odometry:
         k = round(30 * (one["stamp_s"] - BEGIN_S))
@@ -159,6 +157,6 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
     assert heard["/bmask_slam/landmarks"][-1]["fields"] == ["x", "y", "z", "rgb"]
     assert heard["/bmask_slam/path"][-1]["poses"] >= 1
     assert heard["/diagnostics"][-1]["status"] == "OK"
-    assert len(heard["/bmask_slam/pose"]) >= FRAMES / 4
+    assert len(heard["/bmask_slam/pose"]) == len(odometry)
     mounting = resolve(SystemConfig, out / "config.yaml").sensors.odometry.camera_in_base
     assert np.allclose(T_of(mounting), T_BASE_CAMERA)
