@@ -9,9 +9,6 @@ from types import ModuleType
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import in_short
 
-DENSE_LIBRARIES = ("torch", "numba")
-"""What a dense map needs, in the order in which it is asked for."""
-
 
 def import_extra(name: str, needed_by: str, extra: str, instead: str = "") -> ModuleType:
     """A module of a library that the pip extra ``extra`` installs.
@@ -32,6 +29,12 @@ def import_extra(name: str, needed_by: str, extra: str, instead: str = "") -> Mo
         if not missing:
             cure = f"remove it, and {cure}"
         raise InputError(f"{text}; {cure}{f', or {instead}' if instead else ''}") from error
+
+
+def import_dense(needed_by: str) -> None:
+    """Import what a dense map needs. Raises InputError as ``import_extra``."""
+    for library in ("torch", "numba"):
+        import_extra(library, needed_by, "dense")
 
 
 def load_libusb() -> None:

@@ -36,7 +36,7 @@ _LEAST = 1.0
 
 
 def recover(
-    information: PoseInformation, edges: Ints, kind: str, at_rest: bool = True
+    information: PoseInformation, edges: Ints, kind: str, at_rest: bool
 ) -> list[RelativePose]:
     """Relative poses on a tree (E, 2) of rows that replace the dense information.
 

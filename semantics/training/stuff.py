@@ -17,6 +17,7 @@ from torch.nn import functional as F
 
 from bmask_slam.graph.arrays import Bytes, Image
 from bmask_slam.graph.whole_file import open_plain, whole_file
+from bmask_slam.semantics.network.backbone.layers import keep_variance
 from bmask_slam.semantics.network.yolox.layers import ConvSiLU
 from bmask_slam.semantics.network.yolox.network import YoloxNano
 from bmask_slam.semantics.network.yolox.stuff import StuffHead
@@ -211,11 +212,7 @@ def _first(detector: YoloxNano, classes: int, config: StuffTrainingConfig) -> St
     """The head at the begin of its training."""
     torch.manual_seed(config.seed)
     head = StuffHead(classes)
-    for part in head.modules():
-        if isinstance(part, nn.Conv2d):
-            nn.init.kaiming_normal_(part.weight, nonlinearity="relu")
-            assert part.bias is not None
-            nn.init.zeros_(part.bias)
+    keep_variance(head)
     nn.init.normal_(head.logits.weight, std=0.05)
     head.begin_from(detector)
     return with_norms(head).train()

@@ -19,7 +19,7 @@ from bmask_slam.config.configuration import dump
 from bmask_slam.datasets.weights import find_weights
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.extras import DENSE_LIBRARIES, import_extra
+from bmask_slam.graph.extras import import_dense
 from bmask_slam.graph.sensors.streams import read_folder
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps
 from bmask_slam.graph.trajectory_formats import read_trajectory
@@ -217,8 +217,7 @@ def _system_maker(
     if given is not None:
         return given, None
     if options.dense:
-        for library in DENSE_LIBRARIES:
-            import_extra(library, "--map", "dense")
+        import_dense("--map")
     chosen = options.config.semantics.segmenter
     segmenter = (
         NoSegmenter() if options.localise else make_segmenter(chosen, sequence.folder, find_weights)

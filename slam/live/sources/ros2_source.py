@@ -19,7 +19,7 @@ from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.ros2.sensors import ImageClock, Ros2Sensors, mounted
-from bmask_slam.live.ros2.transport import LATCHED, SENSOR, STATE, Node, Reader
+from bmask_slam.live.ros2.transport import LATCHED, SENSOR, STATE, Node, Quality, Reader
 from bmask_slam.live.sources.message_frames import message_frames
 from bmask_slam.live.sources.pairing import DEPTH, RGB, Pair, Pairer
 from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
@@ -52,7 +52,7 @@ class _Heard:
     def __init__(self, node: Node, name: str, options: Ros2Options) -> None:
         self.path = Path(name)
         self._node, self.expected_s = node, EXPECTED_SHARE * options.silence_s
-        self._images = STATE if options.reliable else SENSOR
+        self._images = options.image_quality
         self._readers: dict[str, list[Reader]] = {}
         self._messages: dict[str, list[Any]] = {}
 
@@ -108,6 +108,11 @@ class Ros2Options:
     silence_s: float = 10.0
     reliable: bool = False
 
+    @property
+    def image_quality(self) -> Quality:
+        """Quality of service with which images are received."""
+        return STATE if self.reliable else SENSOR
+
 
 class Ros2Source(MeasuredSource):
     """Colour and depth images of a ROS 2 domain, paired by the stamps in their headers.
@@ -147,7 +152,7 @@ class Ros2Source(MeasuredSource):
         self._frame = first_message(heard, self._topics.rgb).header.frame_id.lstrip("/")
         self._heard.keep(TRANSFORMS)
         self._pairer = Pairer[Any](self.counts, self.camera.depth_time_offset_s)
-        kinds, quality = self.node.published(), STATE if options.reliable else SENSOR
+        kinds, quality = self.node.published(), options.image_quality
         names = (self._topics.rgb, self._topics.depth)
         self._readers = [self.node.reader(name, kinds[name], quality) for name in names]
         self.sensors = Ros2Sensors(self.node, options.sensors, options.silence_s)
