@@ -195,6 +195,8 @@ def _live_on(arguments: argparse.Namespace, source: Source) -> int:
             if services is not None and services.reset_asked:
                 services.begin(before, slam.out)
             ended_by = play(slam, source, told, listener, services)
+        if listener is not None:
+            listener.finish(slam)
         if ended_by or services is None or not services.reset_asked:
             return _tell(arguments, slam, source, ended_by)
         before, options = slam.out, _next_run(options)

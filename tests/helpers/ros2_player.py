@@ -2,7 +2,10 @@
 
 Arguments: domain, rate in Hz, file for the received messages (JSON), and services to call, each
 after the answer of the one before. Frames that are dropped do not matter: the camera goes to and
-fro until standard input is closed.
+fro until standard input is closed, a step for each odometry that is heard, or every PATIENCE ticks.
+
+Until the first is heard, few colour images have a depth image of their time. Frames that wait
+while a live run starts would be more than it has time for, and it would drop them.
 """
 
 from __future__ import annotations
@@ -39,8 +42,11 @@ T_BASE_CAMERA = make_pose(
 )
 T_ODOM_MAP = se3_exp(np.array([0, 0, 0.7, 3.0, -2.0, 0]))
 BEGIN_S = 1000.0
-LONGEST_S = 400.0
-PLACES, WAITING = 10, 300
+LONGEST_S, QUIET_S = 400.0, 2.0
+"""Of playing; and of silence after it, when all is received that was sent."""
+PLACES, WAITING, PATIENCE = 10, 9000, 25
+"""The camera's places; ticks that it has for waiting at the first; those of which one has a frame
+until odometry is heard, so that none waits in a queue of ten images with another."""
 
 
 def place(k: int) -> int:
@@ -156,22 +162,44 @@ def main() -> None:
     heard: dict[str, list] = {topic: [] for topic in HEARD}
     rendered = [render_plane(pose(k), k) for k in range(PLACES)]
     caller = Caller(node, sys.argv[4:])
-    k, end_s, ends = -WAITING, time.monotonic() + LONGEST_S, False
-    while not ends and time.monotonic() < end_s:
-        ends = bool(select.select([sys.stdin], [], [], 0)[0])  # what came until then is read
-        for topic, reader in readers.items():
-            for received in reader.take():
-                heard[topic].append(told(received))
+
+    def hear() -> bool:
+        """Take what has come; whether anything has."""
+        found = {topic: list(map(told, reader.take())) for topic, reader in readers.items()}
+        for topic, messages in found.items():
+            heard[topic] += messages
+        return any(found.values())
+
+    def play(k: int, rgb: bool = True, depth: bool = True) -> None:
+        """Send a frame, or one of its images."""
         stamp_s, frame = BEGIN_S + k / 30, rendered[place(k)]
         infos.send(info(stamp_s))
         odometry.send(wheels(k))
-        colours.send(image(stamp_s, "rgb8", frame.rgb))
-        depths.send(image(stamp_s, "32FC1", frame.depth_m.astype(np.float32)))
-        if heard["/bmask_slam/odometry"]:
+        if rgb:
+            colours.send(image(stamp_s, "rgb8", frame.rgb))
+        if depth:
+            depths.send(image(stamp_s, "32FC1", frame.depth_m.astype(np.float32)))
+
+    k, idle, known, end_s = -WAITING, 0, 0, time.monotonic() + LONGEST_S
+    while not select.select([sys.stdin], [], [], 0)[0] and time.monotonic() < end_s:
+        hear()
+        poses = heard["/bmask_slam/odometry"]
+        waits = not node.published().keys() >= HEARD.keys()  # what is tracked would go unheard
+        if not waits and (len(poses) > known or idle >= PATIENCE):
+            k = max(k, 0) if poses else k
+            play(k)
+            k, idle, known = k + 1, 0, len(poses)
+        elif not poses:
+            play(k, rgb=k % 2 == 0, depth=k % 2 == 1)
+            k += 1
+        if poses:
             caller.step(k)
-        # the camera waits at its first place until it hears that somebody tracks
-        k = max(k + 1, 0) if heard["/bmask_slam/odometry"] else min(k + 1, -1)
+        idle += 1
         time.sleep(1 / rate_hz)
+    quiet_s = time.monotonic()
+    while time.monotonic() < quiet_s + QUIET_S:
+        quiet_s = time.monotonic() if hear() else quiet_s
+        time.sleep(0.02)
     Path(out).write_text(json.dumps(heard | {"answers": caller.answers}))
 
 

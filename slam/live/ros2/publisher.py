@@ -64,6 +64,7 @@ class Ros2Publisher:
         self._thread = ThreadPoolExecutor(1, "grid", _with_low_priority)
         self._making: Future[float] | None = None
         self._run: LiveRun | None = None
+        self._last_s = 0.0
         self._told: MapObjects | None = None
 
     def __call__(self, result: FrameResult, run: LiveRun) -> None:
@@ -76,7 +77,8 @@ class Ros2Publisher:
         if result.segment != self._segment and result.status is not TrackingStatus.LOST:
             self._segment_may_have_changed(run)
         self._outputs.frame(result, known=result.segment == self._segment)
-        stamp_s = self._ros_time(result.timestamp_s)
+        self._last_s = result.timestamp_s
+        stamp_s = self._ros_time(self._last_s)
         if self._is_due("map", PERIOD_S):
             self._publish_map(stamp_s, run)
         if self._is_due("objects", OBJECTS_S):
@@ -86,6 +88,11 @@ class Ros2Publisher:
                 self._outputs.objects(stamp_s, found)
         if self._is_due("grid", GRID_S):
             self._publish_grid(stamp_s, run)
+
+    def finish(self, run: LiveRun) -> None:
+        """Publish path and landmarks of a run that has ended, as they were optimised at its end."""
+        if run is self._run:  # else it has tracked nothing
+            self._publish_map(self._ros_time(self._last_s), run)
 
     def _begin(self) -> None:
         """Nothing is known of a run's map yet, and everything is due."""

@@ -182,3 +182,7 @@ def test_maps_are_published_when_they_are_due(monkeypatch) -> None:
     assert counts["/bmask_slam/objects"] == counts["/bmask_slam/object_markers"] == 1
     assert 1 <= counts["/bmask_slam/map"] == counts["/bmask_slam/cloud"] <= 2
     assert node.topics["/bmask_slam/map"][-1].info.width > 20
+    publish.finish(Run())  # which has tracked nothing
+    assert len(node.topics["/bmask_slam/path"]) == 8
+    publish.finish(run)
+    assert len(node.topics["/bmask_slam/path"]) == len(node.topics["/bmask_slam/landmarks"]) == 9
