@@ -13,7 +13,7 @@ import numpy as np
 
 from bmask_slam.runtime import machine
 from bmask_slam.runtime.machine import versions
-from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.sequence import open_sequence
 
 PACKAGES = ("gtsam", "numpy", "opencv-python-headless", "open3d", "scipy")
 YARDSTICK_FRAMES = 40

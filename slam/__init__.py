@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from bmask_slam.live.start import LiveOptions
     from bmask_slam.run_folder.reader import Run
     from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
-    from bmask_slam.sequences import open_sequence
     from bmask_slam.sequences.frame import Frame
+    from bmask_slam.sequences.sequence import open_sequence
     from bmask_slam.system import SlamSystem
     from bmask_slam.system_config import SystemConfig
     from bmask_slam.tracking.results import FrameResult, TrackingStatus
@@ -72,7 +72,7 @@ _MODULES = {
     "make_segmenter": "api",
     "map_run": "api",
     "merge_runs": "api",
-    "open_sequence": "sequences",
+    "open_sequence": "sequences.sequence",
     "run": "api",
 }
 """The module of each public name."""

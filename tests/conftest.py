@@ -118,6 +118,6 @@ def late_sweep(rendered: Callable[[RenderConfig], Path]) -> Path:
 @pytest.fixture(scope="session")
 def sweep_camera(late_sweep: Path) -> Camera:
     """The right camera of ``late_sweep``."""
-    from bmask_slam.sequences import read_camera
+    from bmask_slam.sequences.cameras import read_camera
 
     return replace(read_camera(late_sweep / "camera.yaml"), depth_time_offset_s=SWEEP_DELAY_S)

@@ -184,7 +184,7 @@ def make_bag(sequence: Path, path: Path) -> None:
     import numpy as np
     from recorded_bags import BagMaker, camera_info, image
 
-    from bmask_slam.sequences import open_sequence
+    from bmask_slam.sequences.sequence import open_sequence
 
     recording, info = open_sequence(sequence), camera_info((0.0,) * 5)
     camera = recording.camera

@@ -33,7 +33,7 @@ from bmask_slam.graph.geometry import inverse, se3_exp, skew
 from bmask_slam.graph.trajectory import Trajectory, associate, nearest_indices, read_tum, write_tum
 from bmask_slam.mapping.open3d_loader import load_open3d
 from bmask_slam.run_folder.map_file import read_run
-from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.sequences.sequence import Sequence, open_sequence
 
 MAX_DEPTH_M = 8.0
 APART_S, MIN_MATCHES = (0.3, 1.6), 15

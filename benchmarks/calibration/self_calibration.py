@@ -30,7 +30,7 @@ from bmask_slam.graph.calibration.model import PARAMETERS, parameters_of
 from bmask_slam.graph.camera import Camera
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.rendering.sequence import RenderConfig, render_sequence
-from bmask_slam.sequences import read_camera, write_camera
+from bmask_slam.sequences.cameras import read_camera, write_camera
 from bmask_slam.system_config import SystemConfig
 
 KEYPOINTS = (800, 825, 850, 875, 900)

@@ -31,7 +31,8 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.mapping.open3d_loader import load_open3d
-from bmask_slam.sequences import open_sequence, read_camera
+from bmask_slam.sequences.cameras import read_camera
+from bmask_slam.sequences.sequence import open_sequence
 
 MODULE = "benchmarks.cameras.frame_to_frame"
 WHEELS = {

@@ -48,7 +48,7 @@ from benchmarks.paths import KITCHEN, ROOT, SHARED
 from benchmarks.suite.hard_sequences import Hardship, make_hard
 from benchmarks.suite.measure import call, render
 from bmask_slam.evaluation import evaluate
-from bmask_slam.sequences import read_camera, write_camera
+from bmask_slam.sequences.cameras import read_camera, write_camera
 
 FOLDERS = {
     "rpy": SHARED / "tum_fr1_rpy", "rpy-none": SHARED / "tum_fr1_rpy",

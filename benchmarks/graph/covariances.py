@@ -25,7 +25,7 @@ from bmask_slam.graph.factors.graph_update import GraphUpdate
 from bmask_slam.graph.geometry import adjoint, inverse, se3_log
 from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
 from bmask_slam.graph.trajectory import associate_stamps
-from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.sequence import open_sequence
 from bmask_slam.system import SlamSystem
 
 

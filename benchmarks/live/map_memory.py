@@ -21,7 +21,7 @@ from benchmarks.live.session import own_mb
 from bmask_slam.config.configuration import resolve
 from bmask_slam.live.replica import DeltaMaker, apply_delta
 from bmask_slam.runtime.memory import give_back_memory
-from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.sequence import open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.frame_history import FrameHistory

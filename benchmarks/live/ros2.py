@@ -27,8 +27,8 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.live.ros2.dds import DdsNode
 from bmask_slam.live.ros2.messages import header, type_name
 from bmask_slam.live.ros2.transport import LATCHED, SENSOR, STATE, typestore
-from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.bags.ros_images import stamp_s
+from bmask_slam.sequences.sequence import open_sequence
 
 LOOPBACK = """<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterface name="lo"
 multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast></General><Discovery>

@@ -35,8 +35,8 @@ from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.play import PlayOptions, play
 from bmask_slam.live.sources.source import MeasuredSource, SourceCounts, paced
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
-from bmask_slam.sequences import Sequence, open_sequence
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system_config import SystemConfig
 
 SAMPLES = 120

@@ -22,7 +22,7 @@ from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.loops.closing import LoopCloser
 from bmask_slam.loops.verification import LoopConstraint
-from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.world_map import Keyframe, WorldMap

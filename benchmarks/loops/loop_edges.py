@@ -40,7 +40,7 @@ from bmask_slam.loops.verification import LoopConstraint, NoLoop, loop_view, ver
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.offline.runner import run
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
-from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.world_map import WorldMap

@@ -26,7 +26,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.trajectory import associate_stamps
 from bmask_slam.loops.place_recognition import PlaceConfig, PlaceRecogniser
-from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.sequence import open_sequence
 
 SAME_PLACE = 0.3  # of the keypoints seen
 SOME_PLACE = 0.1  # less than this is a wrong place

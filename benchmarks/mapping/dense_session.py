@@ -28,7 +28,7 @@ from bmask_slam.mapping.surface.depth_frame import depth_frame
 from bmask_slam.mapping.surface.extraction import extract
 from bmask_slam.mapping.surface.volume import SurfaceVolume
 from bmask_slam.runtime.memory import peak_rss_mb
-from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.sequences.sequence import Sequence, open_sequence
 
 VOXEL_M = 0.01
 STRIDE, SHARED = 2, 13

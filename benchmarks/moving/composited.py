@@ -31,9 +31,9 @@ from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.rendering.annotations import VisibleInstance, coco, visible_instances
 from bmask_slam.rendering.writer import new_folder, stored_depth, write_json, write_lists, write_png
-from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.cameras import write_camera
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.sequence import open_sequence
 from bmask_slam.system_config import SystemConfig
 
 LEG_S = 1.5

@@ -40,7 +40,7 @@ from bmask_slam.semantics.objects.boxes3d import OrientedBox, box_around, box_io
 from bmask_slam.semantics.objects.object_map import pixel_rays
 from bmask_slam.semantics.objects.publication import MapObject
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
-from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.world_map import Keyframe

@@ -18,8 +18,9 @@ from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.trajectory import Trajectory, associate_stamps, write_tum
 from bmask_slam.rendering.engine.sensor import blur, optical_flow
 from bmask_slam.rendering.writer import new_folder, stored_depth, write_png
-from bmask_slam.sequences import Sequence, open_sequence, write_camera
+from bmask_slam.sequences.cameras import write_camera
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.tracking.rolling_shutter import share_of_rows
 
 BURST, PAUSE = 12, 18

@@ -27,7 +27,7 @@ from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.trajectory import associate_stamps
-from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.sequences.sequence import Sequence, open_sequence
 
 GAPS = (1, 5, 15)
 STEP = 10

@@ -32,8 +32,7 @@ from bmask_slam.evaluation import evaluate
 from bmask_slam.graph.errors import InputError
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.rendering.sequence import RenderConfig, render_sequence
-from bmask_slam.sequences import write_camera
-from bmask_slam.sequences.cameras import read_camera
+from bmask_slam.sequences.cameras import read_camera, write_camera
 from bmask_slam.system_config import SystemConfig
 
 KINECT_V1 = {"rolling_shutter_s": 0.022, "depth_time_offset_s": -0.0145}

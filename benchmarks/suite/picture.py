@@ -28,8 +28,8 @@ from bmask_slam.graph.metrics import absolute_error
 from bmask_slam.graph.trajectory import Trajectory, associate, associate_stamps, read_tum
 from bmask_slam.semantics.instances.overlay import draw
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
-from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.sequence import open_sequence
 
 VIEW_SIZE = (960, 720)
 BACKGROUND = 24

@@ -29,7 +29,8 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.rendering.sequence import RenderConfig, render_sequence
 from bmask_slam.run_folder.map_file import read_run
-from bmask_slam.sequences import open_sequence, read_camera, write_camera
+from bmask_slam.sequences.cameras import read_camera, write_camera
+from bmask_slam.sequences.sequence import open_sequence
 from bmask_slam.system_config import SystemConfig
 
 NAMES = ("tum_fr1_rpy", "bonn_crowd", "redkitchen", "office")

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy
@@ -35,6 +35,7 @@ Header = dict[str, Any]
 _HEADER = "header"
 _HEADERS = TypeAdapter(Header)
 _KINDS = "biufU"
+COMPRESSION = 3
 SPARE_ROWS = 1000
 """A table may have so many times as many rows as ids and 4000 more: days of tracking."""
 _UNREADABLE = (  # RuntimeError: a damaged byte may ask for encryption or another compression
@@ -70,8 +71,7 @@ def write_arrays(path: Path, kind: FileKind, header: Header, arrays: Arrays) -> 
     try:
         with whole_file(path) as temporary, temporary.open("wb") as file:
             named = {_HEADER: np.array(json.dumps(header, sort_keys=True)), **arrays}
-            save = np.savez_compressed if kind.compressed else np.savez
-            save(file, allow_pickle=False, **named)
+            _write_zip(file, kind, named)
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
@@ -79,6 +79,15 @@ def write_arrays(path: Path, kind: FileKind, header: Header, arrays: Arrays) -> 
             f"{path}: the {kind.noun} cannot be written ({error.strerror}); free some space or "
             "choose another folder"
         ) from error
+
+
+def _write_zip(file: IO[bytes], kind: FileKind, arrays: Arrays) -> None:
+    """As ``numpy.savez_compressed``, at a level that takes half the time for 2 % more bytes."""
+    method = zipfile.ZIP_DEFLATED if kind.compressed else zipfile.ZIP_STORED
+    with zipfile.ZipFile(file, "w", method, compresslevel=COMPRESSION) as zipped:
+        for name, array in arrays.items():
+            with zipped.open(f"{name}.npy", "w", force_zip64=True) as member:
+                npy.write_array(member, np.asanyarray(array), allow_pickle=False)
 
 
 def read_arrays(path: Path, kind: FileKind) -> tuple[Header, Arrays]:

@@ -32,7 +32,8 @@ from bmask_slam.graph.smoother.storage import read_graph
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, nearest_indices, read_tum
 from bmask_slam.run_folder.map_file import SavedRun, read_run
 from bmask_slam.run_folder.origin import find_sequence
-from bmask_slam.sequences import Sequence, open_sequence, read_camera, write_camera
+from bmask_slam.sequences.cameras import read_camera, write_camera
+from bmask_slam.sequences.sequence import Sequence, open_sequence
 
 MIN_KEYFRAMES = 5
 MIN_REFERENCE_POSES = 5

@@ -29,7 +29,7 @@ from bmask_slam.graph.calibration.registration import Registration, register
 from bmask_slam.graph.camera import Camera
 from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.run_folder.metrics import row
-from bmask_slam.sequences import Sequence
+from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.tracking.rolling_shutter import share_of_rows
 
 NORMAL_95 = 1.96

@@ -88,8 +88,9 @@ def add_info(commands: Commands) -> None:
 
 def _info(arguments: argparse.Namespace) -> int:
     from bmask_slam.graph.files.json_file import format_json
-    from bmask_slam.sequences import format_info, info_as_json, open_sequence, sequence_info
     from bmask_slam.sequences.bags.bag_file import format_topics, is_bag, open_bag
+    from bmask_slam.sequences.info import format_info, info_as_json, sequence_info
+    from bmask_slam.sequences.sequence import open_sequence
 
     if is_bag(arguments.sequence):
         with open_bag(arguments.sequence) as bag:

@@ -29,7 +29,7 @@ from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
-from bmask_slam.sequences import Sequence
+from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.tracking.results import FrameResult
 from bmask_slam.world.world_map import Keyframe, WorldMap
 

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.graph.arrays import Array, Floats, Image, Ints
-from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import FileKind
-from bmask_slam.graph.inertial.tables import InertialState
-from bmask_slam.graph.sensors.streams import Measurements
-from bmask_slam.labelling.results import MapObjects
-from bmask_slam.live.replica import WorldDelta
-from bmask_slam.semantics.instances.instances import Instance, PackedMask
-from bmask_slam.tracking.results import Tracked
-from bmask_slam.world.appearance import Patches
-from bmask_slam.world.frame_history import Entries
+
+if TYPE_CHECKING:  # a process loads what its own messages hold
+    from bmask_slam.back_end.reinterpretation import KeyframeMotion
+    from bmask_slam.graph.camera import Camera
+    from bmask_slam.graph.inertial.tables import InertialState
+    from bmask_slam.graph.sensors.streams import Measurements
+    from bmask_slam.labelling.results import MapObjects
+    from bmask_slam.live.replica import WorldDelta
+    from bmask_slam.semantics.instances.instances import Instance, PackedMask
+    from bmask_slam.tracking.results import Tracked
+    from bmask_slam.world.appearance import Patches
+    from bmask_slam.world.frame_history import Entries
 
 STATE_FILE = FileKind("live state", 6)
 """What the map's process saves: its system's state, and the camera in the header."""

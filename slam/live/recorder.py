@@ -15,7 +15,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.live.health import Health
 from bmask_slam.run_folder.folder import CAMERA, HEALTH, RunFolder
-from bmask_slam.sequences import format_camera
+from bmask_slam.sequences.cameras import format_camera
 from bmask_slam.tracking.results import FrameResult
 
 logger = logging.getLogger(__name__)

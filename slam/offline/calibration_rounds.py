@@ -22,7 +22,7 @@ from bmask_slam.evaluation import frame_stamps
 from bmask_slam.graph.errors import InputError
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.run_folder.origin import find_sequence, read_origin
-from bmask_slam.sequences import write_camera
+from bmask_slam.sequences.cameras import write_camera
 from bmask_slam.system_config import SystemConfig
 
 logger = logging.getLogger(__name__)

@@ -32,7 +32,7 @@ from bmask_slam.offline.self_calibration import SelfCalibrator
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder
 from bmask_slam.run_folder.frame_file import FRAMES
 from bmask_slam.run_folder.metrics import RunCounters
-from bmask_slam.sequences import Sequence
+from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.system_interface import System
 

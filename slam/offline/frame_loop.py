@@ -24,7 +24,8 @@ from bmask_slam.run_folder.metrics import RunCounters, measure, save
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.runtime.progress import Progress
 from bmask_slam.runtime.stop_request import StopRequest
-from bmask_slam.sequences import Sequence, format_camera
+from bmask_slam.sequences.cameras import format_camera
+from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_interface import System
 from bmask_slam.tracking.results import FrameResult

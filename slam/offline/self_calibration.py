@@ -29,7 +29,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.instances import Instance, PackedMask
 from bmask_slam.semantics.instances.surfaces import Segmented, SurfaceClasses, surfaces_of
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
-from bmask_slam.sequences import Sequence
+from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_interface import System
 

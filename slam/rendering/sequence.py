@@ -223,7 +223,7 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
     return _Job(config, folder, camera, poses, depth_poses, stamps, scene, cast, renderer)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def _built(
     config: RenderConfig, detail: float
 ) -> tuple[dict[str, Any], Cast, Scene, list[PlacedMarker]]:

@@ -32,7 +32,7 @@ from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.run_folder.semantic_files import OBJECTS, SavedObject, read_scene
 from bmask_slam.semantics.objects.boxes3d import EDGES
-from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.sequence import open_sequence
 
 FILM = "film.gif"
 KINDS = (".gif", ".webp", ".mp4")

@@ -16,7 +16,7 @@ from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
-from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.sequence import open_sequence
 from bmask_slam.viewer.scene import Scene
 from bmask_slam.viewer.shown import as_jpeg
 

@@ -18,7 +18,7 @@ import pytest
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
-from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.sequence import open_sequence
 from bmask_slam.system_config import SystemConfig
 
 FRAMES = 60

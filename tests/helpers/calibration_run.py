@@ -15,7 +15,7 @@ from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_exp, tran
 from bmask_slam.graph.smoother.storage import write_graph
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.rendering.writer import stored_depth, write_lists, write_png
-from bmask_slam.sequences import write_camera
+from bmask_slam.sequences.cameras import write_camera
 from bmask_slam.tracking.rolling_shutter import share_of_rows
 
 HALF_ROOM_M = np.array([1.6, 1.3, 1.7])

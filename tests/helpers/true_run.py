@@ -11,7 +11,7 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.files.array_file import nested
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.run_folder.map_file import write_map
-from bmask_slam.sequences import Sequence
+from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.world.map_state import world_state
 from bmask_slam.world.world_map import Keyframe, WorldMap
 

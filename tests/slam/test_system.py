@@ -18,8 +18,8 @@ from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
-from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.sequence import open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult, TrackingStatus

@@ -25,7 +25,7 @@ from bmask_slam.run_folder.semantic_files import LABELS, read_labels
 from bmask_slam.semantics.instances.image_files import decode_image
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
-from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system_config import SystemConfig
 
 MAX_INSTANCE = 65_535

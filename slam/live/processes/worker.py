@@ -204,9 +204,13 @@ def serve(connection: int, child_socket: int, parent_end: int) -> None:
         module, _, function = first[0].partition(":")
         target: Callable[..., None] = getattr(importlib.import_module(module), function)
         gc.freeze()  # the collector need not scan all modules
+        gc.enable()
         target(channel, *first[1])
 
+    gc.disable()  # what is imported stays
     run_first(channel, run)
+    sys.stderr.flush()
+    os._exit(0)  # nothing is left to do, for which Python would take 0.1 s
 
 
 def run_first(channel: Channel, run: Callable[[Any], None]) -> None:

@@ -18,11 +18,11 @@ from bmask_slam.live.sources.cameras.record3d_camera import Record3dSource
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
 from bmask_slam.live.sources.ros2_source import Ros2Options, Ros2Source
 from bmask_slam.live.sources.source import Limited, RecordedSource, Source
-from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.bags.bag_file import is_bag
 from bmask_slam.sequences.bags.sensors import SensorTopics
 from bmask_slam.sequences.bags.topics import BagTopics
 from bmask_slam.sequences.formats.layouts import is_recording_file
+from bmask_slam.sequences.sequence import open_sequence
 
 REALSENSE, OAK, OPENCV, ROS2 = "realsense:", "oak:", "opencv:", "ros2:"
 AZURE, RECORD3D = "azure:", "record3d:"

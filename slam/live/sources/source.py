@@ -15,8 +15,8 @@ import numpy as np
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.sequences import Sequence
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.sequence import Sequence
 
 T = TypeVar("T")
 

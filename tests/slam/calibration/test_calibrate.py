@@ -16,7 +16,8 @@ from bmask_slam.calibration.views import smooth_value
 from bmask_slam.graph.calibration.model import TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.sequences import open_sequence, read_camera, write_camera
+from bmask_slam.sequences.cameras import read_camera, write_camera
+from bmask_slam.sequences.sequence import open_sequence
 
 TRUTH = Camera(320, 240, 262.0, 260.0, 158.0, 121.0, depth_scale=5000.0, depth_offset_m=0.015)
 WRONG = dataclasses.replace(

@@ -15,7 +15,8 @@ from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.camera import Camera
 from bmask_slam.offline.runner import RunOptions, RunSummary, run
 from bmask_slam.run_folder.map_file import read_run
-from bmask_slam.sequences import open_sequence, write_camera
+from bmask_slam.sequences.cameras import write_camera
+from bmask_slam.sequences.sequence import open_sequence
 from bmask_slam.system_config import SystemConfig
 
 CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))

@@ -23,7 +23,7 @@ from bmask_slam.graph.trajectory import write_tum
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
 from bmask_slam.rendering.annotations import CLASSES
 from bmask_slam.semantics.labels import label_set
-from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.sequence import open_sequence
 
 T_WORLD_TRUTH = se3_exp([0.4, -1.1, 0.3, 2.0, -3.0, 1.0])
 NAMES = label_set(CLASSES)

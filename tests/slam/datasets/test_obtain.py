@@ -22,7 +22,7 @@ from bmask_slam.datasets.obtain import RECEIVED, SUMS, obtain, read_sums
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import read_tum
-from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.sequence import open_sequence
 
 CAMERA = {"width": 640, "height": 480, "fx": 50.0, "fy": 50.0, "cx": 31.5, "cy": 23.5,
           "depth_scale": 5000}  # fmt: skip

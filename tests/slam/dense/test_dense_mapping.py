@@ -33,7 +33,7 @@ from bmask_slam.rendering.sequence import RenderConfig
 from bmask_slam.run_folder.map_file import read_map, write_map
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.segmenters.segmenter import CocoSegmenter
-from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.sequence import open_sequence
 
 
 def shares_of(run: Path) -> dict[str, float]:

@@ -31,8 +31,9 @@ from bmask_slam.rendering.rooms import office
 from bmask_slam.rendering.writer import stored_depth, write_lists, write_png
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.labels import label_set
-from bmask_slam.sequences import open_sequence, write_camera
+from bmask_slam.sequences.cameras import write_camera
 from bmask_slam.sequences.right_images import read_right_images
+from bmask_slam.sequences.sequence import open_sequence
 
 CAMERA = Camera(240, 180, fx=197.0, fy=197.0, cx=119.5, cy=89.5, stereo_bf_px_m=25.0)
 COUNT = 5

@@ -19,7 +19,8 @@ from bmask_slam.live.processes import remote_calibration
 from bmask_slam.live.sources.source import RecordedSource
 from bmask_slam.live.start import LiveOptions
 from bmask_slam.run_folder.map_file import read_map, read_run
-from bmask_slam.sequences import Sequence, open_sequence, read_camera
+from bmask_slam.sequences.cameras import read_camera
+from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system_config import SystemConfig
 
 CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))

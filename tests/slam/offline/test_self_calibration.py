@@ -37,7 +37,7 @@ from bmask_slam.run_folder.reader import Run
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
-from bmask_slam.sequences import read_camera
+from bmask_slam.sequences.cameras import read_camera
 from bmask_slam.system_config import SystemConfig
 
 CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))

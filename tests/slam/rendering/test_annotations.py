@@ -17,7 +17,8 @@ from bmask_slam.semantics.objects.object_map import pixel_rays
 
 
 def test_boxes_fit_the_pixels_of_their_objects(tmp_path: Path) -> None:
-    config = RenderConfig("office", frames=3, width=160, height=120, noise=False, fps=2.0, people=1)
+    small = {"width": 160, "height": 120, "noise": False}
+    config = RenderConfig("office", frames=3, fps=2.0, people=6, seed=4, **small)
     folder = render_sequence(config, tmp_path / "office")
     objects = json.loads((folder / OBJECTS_TRUTH).read_text())["objects"]
     boxes = {o["instance_id"]: o for o in objects}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.sequences import SequenceConfig, open_sequence
+from bmask_slam.sequences.sequence import SequenceConfig, open_sequence
 
 
 def break_missing(folder, k):

@@ -10,8 +10,9 @@ import pytest
 from repository import KITCHEN
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.sequences import format_info, open_sequence, sequence_info
+from bmask_slam.sequences.info import format_info, sequence_info
 from bmask_slam.sequences.prefetch import prefetched
+from bmask_slam.sequences.sequence import open_sequence
 
 
 def prefetch_threads() -> int:

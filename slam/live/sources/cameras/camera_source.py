@@ -17,9 +17,8 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.sources.pairing import RGB, GapMeter, StreamClock
 from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
-from bmask_slam.sequences import read_camera
 from bmask_slam.sequences.camera_presets import is_preset
-from bmask_slam.sequences.cameras import given_camera
+from bmask_slam.sequences.cameras import given_camera, read_camera
 from bmask_slam.sequences.checks import check_depth_scale
 from bmask_slam.sequences.frame import Frame
 

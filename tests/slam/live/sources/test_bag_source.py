@@ -26,10 +26,10 @@ from recorded_bags import (
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.sources.bag_source import BagSource
-from bmask_slam.sequences import write_camera
 from bmask_slam.sequences.bags import bag_file as bags
 from bmask_slam.sequences.bags.bag_file import format_topics, is_bag, open_bag
 from bmask_slam.sequences.bags.topics import BagTopics
+from bmask_slam.sequences.cameras import write_camera
 from bmask_slam.sequences.frame import Frame
 
 FORMS = [("a.bag", ""), ("a.mcap", ""), ("folder", "sqlite3"), ("folder", "mcap")]

@@ -18,7 +18,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.live.sources.cameras.camera_source import fit_distortion
 from bmask_slam.live.sources.cameras.opencv_camera import OpenCvSource
 from bmask_slam.live.sources.cameras.realsense_camera import RealSenseSource
-from bmask_slam.sequences import write_camera
+from bmask_slam.sequences.cameras import write_camera
 
 SILENCE_S = 0.3
 DISCONNECTED = object()

@@ -13,8 +13,8 @@ import pytest
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.sources.growing_folder import FINISHED, FollowOptions, GrowingFolder
-from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.sequence import open_sequence
 
 CAMERA = "{width: 32, height: 24, fx: 30, fy: 31, cx: 15, cy: 12, depth_scale: 1000}\n"
 QUICK = FollowOptions(silence_s=0.5, image_timeout_s=0.3, poll_s=0.002)

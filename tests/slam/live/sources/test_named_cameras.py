@@ -21,7 +21,7 @@ from bmask_slam.live.sources.cameras.azure_camera import AzureSource, undistorti
 from bmask_slam.live.sources.cameras.oak_camera import OakSource
 from bmask_slam.live.sources.cameras.record3d_camera import Record3dSource
 from bmask_slam.live.sources.opening import SourceOptions, open_source
-from bmask_slam.sequences import write_camera
+from bmask_slam.sequences.cameras import write_camera
 
 SILENCE_S = 0.3
 K = np.array([[500.0, 0, 318.0], [0, 501.0, 242.0], [0, 0, 1]])

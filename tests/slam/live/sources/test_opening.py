@@ -23,8 +23,9 @@ from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.growing_folder import GrowingFolder
 from bmask_slam.live.sources.opening import SourceOptions, open_source
 from bmask_slam.live.sources.source import RecordedSource, Source
-from bmask_slam.sequences import Sequence, open_sequence, write_camera
 from bmask_slam.sequences.bags.topics import BagTopics
+from bmask_slam.sequences.cameras import write_camera
+from bmask_slam.sequences.sequence import Sequence, open_sequence
 
 FRAMES = 8
 TRUTH = [se3_exp(np.array([0, 0.01 * k, 0, 0.02 * k, 0, 0])) for k in range(FRAMES)]

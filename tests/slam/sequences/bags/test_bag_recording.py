@@ -13,9 +13,9 @@ from small_layouts import COARSE, COLOUR, WALL_M, colour, depth_m, hole
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp
 from bmask_slam.live.sources.bag_source import BagSource
-from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.bags import bag_recording
 from bmask_slam.sequences.bags.topics import KNOWN_TOPICS, BagTopics, split_path
+from bmask_slam.sequences.sequence import open_sequence
 
 
 @pytest.mark.parametrize("name", ["a.bag", "a.mcap", "folder"])

@@ -8,8 +8,8 @@ import pytest
 from fake_run import make_sequence
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.formats.joined import JOINED, Part, read_parts, write_parts
+from bmask_slam.sequences.sequence import open_sequence
 
 
 def part(folder: Path, begin_s: float, end_s: float, shift_s: float) -> Part:

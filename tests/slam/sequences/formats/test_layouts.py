@@ -30,10 +30,10 @@ from bmask_slam.graph.geometry import (
     rotation_from_quaternion,
     se3_exp,
 )
-from bmask_slam.sequences import Sequence, open_sequence
 from bmask_slam.sequences.formats import euroc
 from bmask_slam.sequences.formats.convert import convert
 from bmask_slam.sequences.formats.lzfse import unpack_lzfse
+from bmask_slam.sequences.sequence import Sequence, open_sequence
 
 
 @pytest.fixture(params=SMALL_LAYOUTS, ids=lambda layout: layout.name)
