@@ -22,7 +22,7 @@ from bmask_slam.graph.calibration.equations import (
     squared,
     with_points,
 )
-from bmask_slam.graph.calibration.model import linearise
+from bmask_slam.graph.calibration.model import linearise, residuals_of
 from bmask_slam.graph.calibration.problem import (
     CalibrationProblem,
     CalibrationState,
@@ -155,7 +155,7 @@ def _moved(
 
 
 def _cost(problem: CalibrationProblem, state: CalibrationState, scales: Array) -> float:
-    e2 = squared(linearise(problem.views, *state.values).residuals, scales)
+    e2 = squared(residuals_of(problem.views, *state.values), scales)
     cost = 0.5 * CAUCHY**2 * np.log1p(e2 / CAUCHY**2).sum()
     pose, calibration = prior_residuals(problem, state)
     anchors, _ = anchor_terms(problem, state)

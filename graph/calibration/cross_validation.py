@@ -20,7 +20,7 @@ from bmask_slam.graph.calibration.calibration import (
     calibrate,
 )
 from bmask_slam.graph.calibration.equations import CAUCHY, squared
-from bmask_slam.graph.calibration.model import PARAMETERS, CalibrationViews, linearise
+from bmask_slam.graph.calibration.model import PARAMETERS, CalibrationViews, residuals_of
 from bmask_slam.graph.calibration.problem import CalibrationProblem, CalibrationState
 
 MIN_KEYFRAMES = 5
@@ -128,6 +128,6 @@ def _gains(problem: CalibrationProblem, result: CalibrationResult, judged: list[
 def _costs(problem: CalibrationProblem, result: CalibrationResult, scales: Array) -> Array:
     """The robust cost (M,) of every view."""
     state = CalibrationState(result.poses_world_camera, result.points_world, result.calibration)
-    e2 = squared(linearise(problem.views, *state.values).residuals, scales)
+    e2 = squared(residuals_of(problem.views, *state.values), scales)
     cost: Array = (0.5 * CAUCHY**2 * np.log1p(e2 / CAUCHY**2)).sum(axis=1)
     return cost

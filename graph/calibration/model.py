@@ -112,45 +112,83 @@ def parameters_of(camera: Camera, raw_scale: float) -> Array:
     )
 
 
+@dataclass(frozen=True)
+class _Compared:
+    """Predictions beside measurements: points (M, 3) in the camera when the frame and when their
+    row was taken, R_camera_world (M, 3, 3), weighted residuals (M, 3), weights, and which count.
+    """
+
+    p: Array
+    p_row: Array
+    R: Array
+    residuals: Array
+    weight: Array
+    valid: Mask
+
+
+def residuals_of(
+    views: CalibrationViews, poses: Array, points_world: Array, calibration: Array
+) -> Array:
+    """Residuals (M, 3) as those of ``linearise``, at a third of its time."""
+    return _compared(views, poses, points_world, calibration).residuals
+
+
 def linearise(
     views: CalibrationViews, poses: Array, points_world: Array, calibration: Array
 ) -> Linearised:
     """Residuals and derivatives at poses (K, 4, 4), points (L, 3) and a calibration (18,)."""
+    at = _compared(views, poses, points_world, calibration)
+    by_point, by_calibration = _pixel_derivatives(at.p_row, calibration)
+    depth_by_point, depth_by_calibration = _depth_derivatives(views, at.p_row, calibration)
+    by_point = np.concatenate([by_point, depth_by_point[:, None]], axis=1)
+    by_calibration = np.concatenate([by_calibration, depth_by_calibration[:, None]], axis=1)
+    by_calibration[..., SHUTTER] = (by_point @ views.shutter_velocity[..., None])[..., 0]
+    by_point *= at.weight[..., None]
+    count = len(at.p)
+    p_by_tangent = np.concatenate([skew(at.p), np.broadcast_to(-np.eye(3), (count, 3, 3))], axis=2)
+    return Linearised(
+        at.residuals,
+        by_point @ p_by_tangent,
+        by_point @ at.R,
+        by_calibration * at.weight[..., None],
+        at.valid,
+    )
+
+
+def _compared(
+    views: CalibrationViews, poses: Array, points_world: Array, calibration: Array
+) -> _Compared:
     T_camera_world = inverse(poses)[views.keyframes]
     R = T_camera_world[:, :3, :3]
     p = np.einsum("mij,mj->mi", R, points_world[views.landmarks]) + T_camera_world[:, :3, 3]
     in_front = p[:, 2] > MIN_DEPTH_M
     p = np.where(in_front[:, None], p, [0.0, 0.0, 1.0])
     p_row = p + calibration[SHUTTER] * views.shutter_velocity
-    pixels, by_point, by_calibration = _pixel(p_row, calibration)
-    inverse_depth, depth_by_point, depth_by_calibration = _inverse_depth(views, p_row, calibration)
-    by_point = np.concatenate([by_point, depth_by_point[:, None]], axis=1)
-    by_calibration = np.concatenate([by_calibration, depth_by_calibration[:, None]], axis=1)
-    by_calibration[..., SHUTTER] = (by_point @ views.shutter_velocity[..., None])[..., 0]
-    predicted = np.column_stack([pixels, inverse_depth])
+    predicted = np.column_stack(
+        [_pixel(p_row, calibration), _inverse_depth(views, p_row, calibration)]
+    )
     measured = np.column_stack([views.pixels, views.inverse_depth])
     weight = 1 / np.column_stack([views.sigma_px, views.sigma_px, views.sigma_inverse])
     valid = np.isfinite((predicted - measured) * weight) & in_front[:, None]
     weight = np.where(valid, weight, 0.0)
     residuals = np.where(valid, predicted - measured, 0.0) * weight
-    by_point *= weight[..., None]
-    p_by_tangent = np.concatenate([skew(p), np.broadcast_to(-np.eye(3), (len(p), 3, 3))], axis=2)
-    return Linearised(
-        residuals,
-        by_point @ p_by_tangent,
-        by_point @ R,
-        by_calibration * weight[..., None],
-        valid,
-    )
+    return _Compared(p, p_row, R, residuals, weight, valid)
 
 
-def _pixel(p: Array, calibration: Array) -> tuple[Array, Array, Array]:
-    """Pixels (M, 2), and their derivatives (M, 2, 3) by p (M, 3) and (M, 2, 18)."""
+def _pixel(p: Array, calibration: Array) -> Array:
+    """Pixels (M, 2) of points p (M, 3)."""
+    normalised = p[:, :2] * (1 / p[:, 2])[:, None]
+    distorted = distort_normalised(normalised, calibration[LENS])
+    pixels: Array = calibration[F] * distorted + calibration[C]
+    return pixels
+
+
+def _pixel_derivatives(p: Array, calibration: Array) -> tuple[Array, Array]:
+    """Derivatives of ``_pixel``, (M, 2, 3) by p and (M, 2, 18)."""
     inv_z = 1 / p[:, 2]
     normalised = p[:, :2] * inv_z[:, None]
     x, y = normalised.T
     focal, (k1, k2, p1, p2, k3) = calibration[F], calibration[LENS]
-    distorted = distort_normalised(normalised, calibration[LENS])
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # d(radial)/d(r2), twice
@@ -163,26 +201,38 @@ def _pixel(p: Array, calibration: Array) -> tuple[Array, Array, Array]:
     normalised_by_p[:, 0, 0] = normalised_by_p[:, 1, 1] = inv_z
     normalised_by_p[:, :, 2] = -normalised * inv_z[:, None]
     by_calibration = np.zeros((len(p), 2, len(PARAMETERS)))
-    by_calibration[:, [0, 1], [0, 1]] = distorted
+    by_calibration[:, [0, 1], [0, 1]] = distort_normalised(normalised, calibration[LENS])
     by_calibration[:, [0, 1], [2, 3]] = 1.0
     by_calibration[:, :, LENS] = focal[:, None] * distortion_terms(normalised)
-    pixels = focal * distorted + calibration[C]
-    return pixels, focal[:, None] * (by_normalised @ normalised_by_p), by_calibration
+    return focal[:, None] * (by_normalised @ normalised_by_p), by_calibration
 
 
-def _inverse_depth(
-    views: CalibrationViews, p: Array, calibration: Array
-) -> tuple[Array, Array, Array]:
-    """Raw inverse depth (M,) in the depth image, and its derivatives (M, 3) by p and (M, 18)."""
-    tau_s = views.lag_s + calibration[TIME]
+def _sensor_depth(views: CalibrationViews, p: Array, calibration: Array) -> tuple[Array, Array]:
+    """Depth (M,) in m as the sensor sees it, and the same without the offset."""
     terms = depth_distortion_terms(views.places)
     z_sensor = 1 / np.maximum(1 / p[:, 2] + terms @ calibration[BEND], MIN_INVERSE_DEPTH)
-    factor, z = calibration[FACTOR], np.maximum(z_sensor - calibration[OFFSET], MIN_DEPTH_M)
+    return z_sensor, np.maximum(z_sensor - calibration[OFFSET], MIN_DEPTH_M)
+
+
+def _inverse_depth(views: CalibrationViews, p: Array, calibration: Array) -> Array:
+    """Raw inverse depth (M,) in the depth image."""
+    tau_s = views.lag_s + calibration[TIME]
+    _, z = _sensor_depth(views, p, calibration)
+    raw: Array = calibration[FACTOR] / z + tau_s * views.inverse_depth_rate
+    return raw
+
+
+def _depth_derivatives(
+    views: CalibrationViews, p: Array, calibration: Array
+) -> tuple[Array, Array]:
+    """Derivatives of ``_inverse_depth``, (M, 3) by p and (M, 18)."""
+    factor, (z_sensor, z) = calibration[FACTOR], _sensor_depth(views, p, calibration)
     by_p = np.zeros_like(p)
     by_p[:, 2] = -factor / z**2 * (z_sensor / p[:, 2]) ** 2
     by_calibration = np.zeros((len(p), len(PARAMETERS)))
     by_calibration[:, FACTOR] = 1 / z
     by_calibration[:, OFFSET] = factor / z**2
+    terms = depth_distortion_terms(views.places)
     by_calibration[:, BEND] = (factor / z**2 * z_sensor**2)[:, None] * terms
     by_calibration[:, TIME] = np.nan_to_num(views.inverse_depth_rate)
-    return factor / z + tau_s * views.inverse_depth_rate, by_p, by_calibration
+    return by_p, by_calibration
