@@ -19,7 +19,9 @@ from bmask_slam.sequences.cameras import write_camera
 from bmask_slam.sequences.sequence import open_sequence
 from bmask_slam.system_config import SystemConfig
 
-CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
+CONFIG = resolve(
+    SystemConfig, None, ("semantics.segmenter.name=none", "features.max_keypoints=400")
+)
 FRAMES, FPS = 100, 15.0
 
 

@@ -40,7 +40,9 @@ from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.sequences.cameras import read_camera
 from bmask_slam.system_config import SystemConfig
 
-CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
+CONFIG = resolve(
+    SystemConfig, None, ("semantics.segmenter.name=none", "features.max_keypoints=400")
+)
 FRAMES = 100
 KILLED = (5, 7)
 """Before the checkpoint of 80 frames, and before that of the new beginning."""
