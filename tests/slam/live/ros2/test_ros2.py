@@ -156,9 +156,8 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
     assert np.allclose(heard["/tf"][-1]["moved"], inverse(T_ODOM_MAP)[:3, 3], atol=0.003)
     assert heard["/bmask_slam/landmarks"][-1]["points"] > 50
     assert heard["/bmask_slam/landmarks"][-1]["fields"] == ["x", "y", "z", "rgb"]
-    saved = (
-        (out / "trajectory.txt").read_text().splitlines()
-    )  # the path is sent once more at the end
+    # the path is sent once more at the end
+    saved = (out / "trajectory.txt").read_text().splitlines()
     assert heard["/bmask_slam/path"][-1]["poses"] == sum(line[0] != "#" for line in saved) >= 1
     assert heard["/diagnostics"][-1]["status"] == "OK"
     assert len(heard["/bmask_slam/pose"]) == len(odometry)
