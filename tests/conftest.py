@@ -42,7 +42,6 @@ def pytest_collection() -> None:
 def pytest_collection_finish() -> None:
     """What was imported stays to the end: the collector need not look at it again and again."""
     gc.freeze()
-    gc.set_threshold(20_000)
     gc.enable()
 
 

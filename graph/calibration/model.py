@@ -129,7 +129,7 @@ class _Compared:
 def residuals_of(
     views: CalibrationViews, poses: Array, points_world: Array, calibration: Array
 ) -> Array:
-    """Residuals (M, 3) as those of ``linearise``, at a third of its time."""
+    """Residuals (M, 3) as those of ``linearise``, without derivatives: a tenth of its time."""
     return _compared(views, poses, points_world, calibration).residuals
 
 

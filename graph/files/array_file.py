@@ -36,6 +36,7 @@ _HEADER = "header"
 _HEADERS = TypeAdapter(Header)
 _KINDS = "biufU"
 COMPRESSION = 3
+"""zlib's level: about half the time of its default, 6, for 0.5 (fused depth) to 2 % (maps) more bytes."""
 SPARE_ROWS = 1000
 """A table may have so many times as many rows as ids and 4000 more: days of tracking."""
 _UNREADABLE = (  # RuntimeError: a damaged byte may ask for encryption or another compression
@@ -82,7 +83,7 @@ def write_arrays(path: Path, kind: FileKind, header: Header, arrays: Arrays) -> 
 
 
 def _write_zip(file: IO[bytes], kind: FileKind, arrays: Arrays) -> None:
-    """As ``numpy.savez_compressed``, at a level that takes half the time for 2 % more bytes."""
+    """The file of ``numpy.savez`` or ``savez_compressed``, at the level COMPRESSION."""
     method = zipfile.ZIP_DEFLATED if kind.compressed else zipfile.ZIP_STORED
     with zipfile.ZipFile(file, "w", method, compresslevel=COMPRESSION) as zipped:
         for name, array in arrays.items():

@@ -17,7 +17,7 @@ from source_tree import SOURCES, location, parse
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.yaml_file import format_yaml, parse_yaml
 
-SECONDS, INPUTS = 6.0, 30
+SECONDS, INPUTS = 8.0, 30
 
 
 @pytest.fixture(scope="module")

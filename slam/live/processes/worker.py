@@ -209,7 +209,7 @@ def serve(connection: int, child_socket: int, parent_end: int) -> None:
 
     gc.disable()  # what is imported stays
     run_first(channel, run)
-    sys.stderr.flush()
+    sys.stdout.flush()
     os._exit(0)  # nothing is left to do, for which Python would take 0.1 s
 
 
