@@ -36,7 +36,7 @@ _HEADER = "header"
 _HEADERS = TypeAdapter(Header)
 _KINDS = "biufU"
 COMPRESSION = 3
-"""zlib's level: about half the time of its default, 6, for 0.5 (fused depth) to 2 % (maps) more bytes."""
+"""zlib's level: half the time of its default, 6, for 0.5 (fused depth) to 2 % (maps) more bytes."""
 SPARE_ROWS = 1000
 """A table may have so many times as many rows as ids and 4000 more: days of tracking."""
 _UNREADABLE = (  # RuntimeError: a damaged byte may ask for encryption or another compression
