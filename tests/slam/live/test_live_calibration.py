@@ -12,7 +12,8 @@ from faults import LONG_S
 from bmask_slam.calibration.adoption import SelfCalibrationConfig
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.errors import InputError
-from bmask_slam.live import start, system
+from bmask_slam.live import live_map, start, system
+from bmask_slam.live import play as play_module
 from bmask_slam.live.live_slam import LiveSlam
 from bmask_slam.live.play import PlayOptions, play
 from bmask_slam.live.processes import remote_calibration
@@ -37,9 +38,11 @@ def played(sequence: Sequence, out: Path, calibrate: str) -> LiveSlam:
 
 @pytest.fixture
 def short_stretch(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Few frames, and what is less sure is used: live, the keyframes differ from run to run."""
-    rules = partial(SelfCalibrationConfig, frames=115, min_gain_sigmas=0.5)
+    """Few frames, each tracked in the map of all keyframes before it, however long that takes."""
+    rules = partial(SelfCalibrationConfig, frames=115)
     monkeypatch.setattr(start, "SelfCalibrationConfig", rules)
+    monkeypatch.setattr(play_module, "WAITING", 0)
+    monkeypatch.setattr(live_map, "MAX_MAP_WAIT_S", LONG_S)
     monkeypatch.setattr(system, "CALIBRATION_S", LONG_S)  # a busy machine, on which a process of
     monkeypatch.setattr(remote_calibration, "NICENESS", 0)  # low priority would not get far
 
