@@ -69,7 +69,7 @@ class LiveMap(SensorInput):
         owners = {"map": system.remote, "segmenter": system.segmenter, "dense": system.dense}
         last = {} if system.calibration is None else {"calibration": system.calibration.pid}
         pids = {name: part.worker.pid for name, part in owners.items() if part is not None}
-        return {name: pid for name, pid in (pids | last).items() if pid}  # 0: on a workstation
+        return {name: pid for name, pid in (pids | last).items() if pid}  # 0: none here
 
     def segment(self) -> int:
         """The number of the largest map segment, which ``map`` and ``trajectory`` are of."""

@@ -1,4 +1,5 @@
-"""Children of a live run are killed at random moments: every tracked pose is on the disk.
+"""Children of a live run are killed at random moments, and the server that forks them: every
+tracked pose is on the disk.
 
 ``BMASK_SLAM_FAULT_SEEDS=20 pytest tests/faults`` tries more than the usual two seeds; every third
 one has a dense map too.
@@ -14,10 +15,12 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from faults import children
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
+from bmask_slam.runtime.fork_server import server_pid
 from bmask_slam.sequences.sequence import open_sequence
 from bmask_slam.system_config import SystemConfig
 
@@ -28,7 +31,7 @@ CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=truth",))
 
 def kills(seed: int) -> Iterator[tuple[int, str]]:
     """Frames before which a child is killed, and its name."""
-    draw, names = random.Random(seed), ["map", "map", "segmenter", "calibration"]
+    draw, names = random.Random(seed), ["map", "map", "segmenter", "calibration", "server"]
     names += ["dense", "dense"] if has_dense(seed) else []
     for _ in range(draw.randint(1, 5)):
         yield draw.randrange(2, FRAMES), draw.choice(names)
@@ -37,11 +40,6 @@ def kills(seed: int) -> Iterator[tuple[int, str]]:
 def has_dense(seed: int) -> bool:
     """Whether a run has a dense map."""
     return seed % 3 == 2
-
-
-def children() -> set[int]:
-    tasks = Path("/proc/self/task").glob("*/children")
-    return {int(pid) for task in tasks for pid in task.read_text().split()}
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -59,8 +57,9 @@ def test_every_tracked_pose_is_saved(slow_office: Path, tmp_path: Path, seed: in
     with LiveSlam(sequence.camera, CONFIG, options) as slam:
         for frame in sequence.frames():
             for name in (name for at, name in plan if at == frame.index):
-                with suppress(ProcessLookupError):  # it has died and is not started again yet
-                    os.kill(slam.processes()[name], signal.SIGKILL)
+                with suppress(ProcessLookupError, KeyError):  # it has died, and none is there yet
+                    pid = server_pid() if name == "server" else slam.processes()[name]
+                    os.kill(pid or slam.processes()["map"], signal.SIGKILL)
             arrived = slam.track(frame.timestamp_s, frame.rgb, frame.depth_m, name=frame.name)
             if arrived.T_world_camera is not None:
                 tracked.append(frame.timestamp_s)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+
+from bmask_slam.runtime.fork_server import server_pid
 
 LONG_S = 300.0
 """Longest time that a test waits for what must happen; a busy machine needs its time."""
@@ -41,6 +45,18 @@ def fill(disk: Path) -> Path:
                 file.write(bytes(1024))
         except OSError:
             return ballast
+
+
+def children() -> set[int]:
+    """Processes that this one or its fork server has started and that still run."""
+    found, waiting, server = set(), [os.getpid()], server_pid()
+    while waiting:
+        for task in Path(f"/proc/{waiting.pop()}/task").glob("*/children"):
+            with suppress(FileNotFoundError):
+                pids = {int(pid) for pid in task.read_text().split()}
+                found |= pids
+                waiting += pids
+    return set(running(sorted(found - {server})))
 
 
 def running(pids: list[int]) -> list[int]:

@@ -7,6 +7,7 @@ frames that were tracked before stay as they are.
 from __future__ import annotations
 
 import logging
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -65,8 +66,9 @@ class CalibrationSetup:
     free: tuple[int, ...]
 
 
-def serve_calibration(channel: Channel, setup: CalibrationSetup) -> None:
+def serve_calibration(channel: Channel, setup: CalibrationSetup, niceness: int) -> None:
     """Keep depth images and estimate until the channel ends."""
+    os.nice(niceness)
     server = CalibrationServer(setup)
     channel.send(Ready())
     for message in channel.messages():

@@ -8,7 +8,6 @@ tracking nor the map waits for it, and a process that dies is not started again.
 from __future__ import annotations
 
 import logging
-import os
 import threading
 from dataclasses import dataclass
 
@@ -52,8 +51,7 @@ class RemoteCalibration:
         self.text = ""
         self._due = setup.config.frames
         self.adopts = setup.mode == "auto"
-        self._worker = Worker("calibration", TARGET, setup)
-        os.setpriority(os.PRIO_PROCESS, self._worker.pid, NICENESS)  # from its start on
+        self._worker = Worker("calibration", TARGET, setup, NICENESS)
         self._frames = 0
         self._awaited_save: int | None = None
         self._last: list[DepthImage] = []

@@ -1,8 +1,9 @@
 """A child process that handles messages, and its owner's end of the connection.
 
-The child is a new interpreter with a socket, so that the caller's script needs no ``if __name__ ==
-"__main__"`` and nothing else is inherited. It ends when its owner does, for whatever reason. It
-stays in its owner's session, since Linux compares priorities only within a session (autogroups).
+The child is forked by a server (Linux), or a new interpreter, so that the caller's script needs no
+``if __name__ == "__main__"`` and of its owner only a socket is inherited. It ends when its owner
+does, for whatever reason. It stays in its owner's session, since Linux compares priorities only
+within a session (autogroups).
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ from typing import Any, Protocol
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.channel import Channel, ForwardedLog
 from bmask_slam.live.shared_memory import SIZE, Ring, anonymous_file
+from bmask_slam.runtime import fork_server
+from bmask_slam.runtime.fork_server import ForkedProcess, Start
 from bmask_slam.runtime.stop_request import SIGNALS
 
 logger = logging.getLogger(__name__)
@@ -105,16 +108,8 @@ class Worker:
         self.name = name
         parent_end, child_socket = socket.socketpair()
         files = [anonymous_file(SIZE) for _ in range(2)]
-        descriptors = [child_socket.fileno(), *files]
-        code = f"from {__name__} import serve; serve(*{descriptors})"
         try:
-            self._process = subprocess.Popen(  # nosec B603 # this module, by number of descriptors
-                [sys.executable, "-P", "-c", code],
-                pass_fds=descriptors,
-                stdin=subprocess.DEVNULL,
-                env=os.environ | ONE_THREAD | safe_import_path(),
-                process_group=0,  # Ctrl-C in a terminal must reach only the owner
-            )
+            self._process = _started(target, [child_socket.fileno(), *files])
             self._channel = Channel(
                 Connection(parent_end.detach()), (Ring(files[0]), Ring(files[1]))
             )
@@ -126,7 +121,7 @@ class Worker:
 
     @property
     def pid(self) -> int:
-        """Process id."""
+        """Process id, 0 if the process could not be started."""
         return self._process.pid
 
     @property
@@ -175,6 +170,29 @@ class Worker:
         self._process.wait()
         self._channel.drain()
         self._channel.close()
+
+
+def _started(target: str, descriptors: list[int]) -> ForkedProcess | subprocess.Popen[bytes]:
+    """The process that serves a target with these descriptors."""
+    environment = os.environ | ONE_THREAD | safe_import_path()
+    if fork_server.IS_SUPPORTED:
+        module = target.partition(":")[0]
+        is_own = module.startswith(f"{__name__.partition('.')[0]}.")
+        start = Start(
+            f"{__name__}:serve",
+            module if is_own else __name__,
+            environment,
+            environment["PYTHONPATH"].split(os.pathsep),
+            os.getcwd(),
+        )
+        return fork_server.start_forked(start, descriptors)
+    return subprocess.Popen(  # nosec B603 # this module, by number of descriptors
+        [sys.executable, "-P", "-c", f"from {__name__} import serve; serve(*{descriptors})"],
+        pass_fds=descriptors,
+        stdin=subprocess.DEVNULL,
+        env=environment,
+        process_group=0,  # Ctrl-C in a terminal must reach only the owner
+    )
 
 
 def safe_import_path() -> dict[str, str]:

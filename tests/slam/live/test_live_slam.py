@@ -6,14 +6,14 @@ import gc
 import json
 import os
 import signal
+import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import faiss
 import numpy as np
 import pytest
-from faults import wait_until
+from faults import children, wait_until
 from feeding import track_frames
 from synthetic_view import CAMERA, PlaneViews, sideways_path
 
@@ -47,14 +47,6 @@ def error_m(poses: Array, first: int = 0) -> float:
     truth = np.array([inverse(TRUTH[first]) @ pose for pose in TRUTH[first : first + len(poses)]])
     found = inverse(poses[0]) @ poses
     return float(np.sqrt(np.mean(np.sum((found - truth)[:, :3, 3] ** 2, axis=1))))
-
-
-def children() -> set[int]:
-    """Child processes of this one that still run."""
-    tasks = Path("/proc/self/task").glob("*/children")
-    found = {int(pid) for task in tasks for pid in task.read_text().split()}
-    states = {p: Path(f"/proc/{p}/stat").read_text().rsplit(")", 1)[1].split()[0] for p in found}
-    return {pid for pid, state in states.items() if state != "Z"}
 
 
 @pytest.fixture(scope="module")
@@ -285,7 +277,8 @@ def test_a_run_that_cannot_start_leaves_no_run_folder(tmp_path) -> None:
     assert not (tmp_path / "run").exists()
 
 
-def test_a_process_that_starts_too_late_is_reported(tmp_path) -> None:
+def test_a_process_that_starts_too_late_is_reported(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(worker, "_started", lambda *_: subprocess.Popen(["sleep", "600"]))
     before = children()
     with pytest.raises(InputError, match="segmenter's process has not begun within 0 s"):
         RemoteSegmenter(SegmenterOptions("none"), tmp_path, policy=RestartPolicy(start_s=0.0))

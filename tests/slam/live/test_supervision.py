@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import os
+import itertools
+import time
 from types import SimpleNamespace
 
 import pytest
-from faults import Clock, wait_until
+from faults import LONG_S, Clock, wait_until
 
+from bmask_slam.live.channel import Channel
 from bmask_slam.live.processes import supervision
 from bmask_slam.live.processes.supervision import RestartPolicy, SupervisedWorker
 from bmask_slam.live.processes.worker import Worker
@@ -54,13 +56,22 @@ def test_silence_counts_by_the_processor_time_that_was_used(
     assert worker.crashes == hangs
 
 
+def use_processor(channel: Channel) -> None:
+    """Work until a message comes; answers with the processor's time that was used."""
+    while time.process_time() < 0.3:
+        pass
+    channel.send("worked")
+    for _ in itertools.islice(channel.messages(), 1):
+        channel.send(time.process_time())
+
+
 def test_the_processor_time_of_a_worker_is_the_systems() -> None:
-    worker = Worker("child", "os:getpid")
+    worker = Worker("child", f"{__name__}:use_processor")
     try:
-        wait_until(lambda: worker.processor_s > 0)
-        assert worker.processor_s < 60
-        worker._process.wait()
+        wait_until(lambda: worker.receive(0.1))
+        worker.send("stop")
+        (used_s,) = worker.receive(LONG_S)
+        assert used_s == pytest.approx(worker.processor_s, abs=0.1)
     finally:
         worker.kill()
-    assert os.times().children_user + os.times().children_system > 0
     assert worker.processor_s == 0
