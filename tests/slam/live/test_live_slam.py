@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import faiss
 import numpy as np
@@ -278,7 +279,8 @@ def test_a_run_that_cannot_start_leaves_no_run_folder(tmp_path) -> None:
 
 
 def test_a_process_that_starts_too_late_is_reported(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(worker, "_started", lambda *_: subprocess.Popen(["sleep", "600"]))
+    silent = partial(subprocess.Popen, ["sleep", "600"])
+    monkeypatch.setattr(worker, "_started", lambda _, files: silent(pass_fds=files))
     before = children()
     with pytest.raises(InputError, match="segmenter's process has not begun within 0 s"):
         RemoteSegmenter(SegmenterOptions("none"), tmp_path, policy=RestartPolicy(start_s=0.0))
