@@ -26,7 +26,11 @@ def whole_file(path: Path) -> Iterator[Path]:
 
     It takes the place of ``path``, of the link itself if that is one, when the block ends well,
     and is removed when it does not.
+
+    Raises:
+        InputError: ``path`` is a folder.
     """
+    _refuse_folder(path)
     temporary = _temporary(path)
     os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
@@ -82,6 +86,21 @@ def remove_partial(folder: Path) -> None:
     """Remove the temporary files and folders that a killed process left in a folder."""
     for path in folder.glob(f"{PREFIX}*"):
         remove(path)
+
+
+def check_target(path: Path) -> None:
+    """Raise InputError if a file cannot be made there, before the work of which it is the result.
+
+    ``path`` is a folder, or there is no folder for it.
+    """
+    _refuse_folder(path)
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: the folder {path.parent} is not there; make it first")
+
+
+def _refuse_folder(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        raise InputError(f"{path}: is a folder; give the name of a file to write")
 
 
 def _temporary(path: Path) -> Path:

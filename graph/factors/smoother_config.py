@@ -62,3 +62,7 @@ class SmootherConfig:
     marginal_keyframes: int = 24
     base_share: float = 0.25
     max_repairs: int = 10
+
+    def __post_init__(self) -> None:
+        if self.relinearize_skip < 1:  # GTSAM divides by it, which ends the process
+            raise ValueError(f"relinearize_skip = {self.relinearize_skip}: must be at least 1")

@@ -28,6 +28,8 @@ from bmask_slam.graph.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
 
+MAX_TOLD = 10
+"""Unknown types that are named; a file of another kind has one a line."""
 LEAST = 1e-9  # eigenvalue of a repaired matrix, of its largest
 _ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])  # its own inverse
 
@@ -57,8 +59,8 @@ def read_rows(
 ) -> tuple[dict[str, Rows], dict[int, int]]:
     """Lines of the given tags, other dialects' among them, and line numbers of FIX by vertex id.
 
-    Lines of other tags are left out, with one warning a tag. ``on_comment`` gets each comment line
-    and its number.
+    Lines of other tags are left out, with one warning a tag, at most `MAX_TOLD`. ``on_comment``
+    gets each comment line and its number.
 
     Raises:
         InputError: naming file and line: a wrong number of columns, a value that is no finite
@@ -85,8 +87,10 @@ def read_rows(
             fixed.update({_id(word, where): number for word in words[1:]})
         else:
             unknown[tag] += 1
-    for tag, count in unknown.items():
+    for tag, count in unknown.most_common(MAX_TOLD):
         logger.warning("%s: %d lines of the unknown type %s left out", path, count, tag[:40])
+    if len(unknown) > MAX_TOLD:
+        logger.warning("%s: lines of %d more unknown types", path, len(unknown) - MAX_TOLD)
     return rows, fixed
 
 

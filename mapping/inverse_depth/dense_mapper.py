@@ -15,6 +15,7 @@ from torch import Tensor
 
 from bmask_slam.graph.arrays import Array, Bytes, Floats, Image, Ints, Mask
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.mapping.inverse_depth.depth_map import (
     InverseDepthMap,
@@ -207,6 +208,16 @@ class DenseMapper:
             own.keyframe, [p.keyframe for p in others.values()], self.config.neighbours
         )
         return fuse_keyframe(own, [others[n.id] for n in chosen], self.camera)
+
+
+def check_device(name: str) -> None:
+    """Raise InputError if torch has no device of this name on this machine."""
+    try:
+        torch.zeros(1, device=name).cpu()
+    except (RuntimeError, AssertionError) as error:  # the latter: a torch without CUDA
+        known = "cpu, cuda" if torch.cuda.is_available() else "cpu; torch sees no GPU"
+        reason = str(error).partition("\n")[0][:80]
+        raise InputError(f"--device {name}: not here ({reason}); there are: {known}") from error
 
 
 def as_image(rgb: Image, device: str = "cpu") -> Tensor:

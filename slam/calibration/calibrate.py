@@ -32,6 +32,7 @@ from bmask_slam.graph.smoother.storage import read_graph
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, nearest_indices, read_tum
 from bmask_slam.run_folder.map_file import SavedRun, read_run
 from bmask_slam.run_folder.origin import find_sequence
+from bmask_slam.run_folder.reader import Run
 from bmask_slam.sequences.cameras import read_camera, write_camera
 from bmask_slam.sequences.sequence import Sequence, open_sequence
 
@@ -121,9 +122,11 @@ def check_options(options: CalibrateOptions) -> Path:
     """The file to write; checks what would otherwise fail after the work.
 
     Raises:
-        InputError: the file exists, its folder does not, or an option is impossible.
+        InputError: there is no run, the file exists, its folder does not, or an option is
+            impossible.
     """
-    out = options.out or options.run / "camera.yaml"
+    run = Run(options.run)
+    out = options.out or run.path / "camera.yaml"
     if out.exists() and not (options.overwrite or _is_of_run(out, options)):
         raise InputError(f"{out}: is there already; choose another --out or add --overwrite")
     if not out.parent.is_dir():

@@ -83,6 +83,7 @@ def add_evaluate_segmentation(commands: Commands) -> None:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     from bmask_slam.datasets.weights import find_weights
+    from bmask_slam.graph.whole_file import check_target
     from bmask_slam.runtime.progress import counting_bar
     from bmask_slam.semantics.instances.coco_files import read_coco
     from bmask_slam.semantics.segmenters.evaluation import (
@@ -94,6 +95,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
     from bmask_slam.semantics.training.dataset import split
 
+    for path in filter(None, (arguments.plot, arguments.curves)):
+        check_target(path)
     options = segmenter_options(arguments, SegmenterOptions(min_score=0.0))
     with counting_bar(arguments.quiet) as progress:
         truth = read_coco(arguments.data)

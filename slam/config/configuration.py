@@ -61,7 +61,7 @@ serves for others."""
 
 def find_config(name: str) -> Path:
     """A YAML file from its path, or from the bare name of one in ``data/configs``."""
-    if re.fullmatch(r"[\w-]+", name):
+    if re.fullmatch(r"[\w-]+", name) and not Path(name).is_file():
         return data_path("configs", f"{name}.yaml")
     return Path(name)
 
@@ -204,7 +204,7 @@ class _GivenValues:
             keys = ", ".join(f"{prefix}{name}" for name in _fields(cls))
             where = prefix.rstrip(".") or "the whole"
             raise InputError(
-                f"{source}: {where} is a group of keys, not {tree!r}; there are: {keys}"
+                f"{source}: {where} is a group of keys, not {str(tree)[:40]!r}; there are: {keys}"
             )
         for key, value in tree.items():
             path, hint = f"{prefix}{key}", _fields(cls).get(key)
@@ -214,6 +214,8 @@ class _GivenValues:
             nested = _nested(hint)
             if nested is None or (value is None and nested is not hint):
                 merged[key] = _checked(value, hint, f"{source}: {path}")
+                if _is_below_zero(value, _default(cls, key)):
+                    raise InputError(f"{source}: {path} = {value} is negative; give 0 or more")
                 self._sources[path] = source
             else:
                 if merged.get(key) is None:
@@ -230,6 +232,11 @@ def _checked(value: Any, hint: Any, where: str) -> Any:
     if isinstance(hint, EnumType) and isinstance(value, str) and value in hint.__members__:
         return hint[value].value
     return value
+
+
+def _is_below_zero(value: Any, default: Any) -> bool:
+    """Whether a whole number is negative; those whose default is above 0 count something."""
+    return all(isinstance(n, int) for n in (value, default)) and value < 0 < default
 
 
 def _default(cls: Any, name: str) -> Any:

@@ -76,6 +76,9 @@ def export_drive_map(
     """
     if not run.is_dir():
         raise InputError(f"{run}: {form} needs the folder of a run with a dense map")
+    suffixes = {"nav2": (".yaml", ".yml", ".pgm", ""), "octomap": (".bt", "")}[form]
+    if out.suffix.lower() not in suffixes:  # files of these names are written, whatever it says
+        raise InputError(f"{out}: {form} is written as {suffixes[0]}; let --out end with it")
     if not out.parent.is_dir():
         raise InputError(f"{out}: the folder {out.parent} does not exist; make it first")
     if out.resolve().parent == run.resolve():

@@ -10,7 +10,7 @@ import numpy as np
 from bmask_slam.config.configuration import resolve
 from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.graph.errors import InputError
-from bmask_slam.mapping.inverse_depth.dense_mapper import DenseConfig, DepthSource
+from bmask_slam.mapping.inverse_depth.dense_mapper import DenseConfig, DepthSource, check_device
 from bmask_slam.mapping.inverse_depth.depth_map import MeasurementConfig
 from bmask_slam.semantics.beliefs.movability import read_priors
 from bmask_slam.semantics.labels import LabelSet
@@ -65,8 +65,10 @@ def resolve_options(options: MapOptions, labels: LabelSet) -> MapOptions:
     """The options, checked, with ``excluded`` filled in.
 
     Raises:
-        InputError: the voxel size is out of range, or an excluded class is not in ``labels``.
+        InputError: the voxel size is out of range, torch has no such device, or an excluded class
+            is not in ``labels``.
     """
+    check_device(options.device)
     low, high = VOXEL_RANGE_M
     for voxel_m in (options.voxel_m, options.surface_voxel_m):
         if not low <= voxel_m <= high:

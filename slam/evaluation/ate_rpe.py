@@ -89,6 +89,8 @@ def evaluate_trajectory(
         InputError: fewer than three poses are associated.
     """
     matched, truth = associate(estimate, reference, max_time_difference_s)
+    if not len(estimate):
+        raise InputError("no frame has a pose, so there is nothing to compare; track it first")
     if len(matched) < MIN_POSES:
         raise InputError(
             f"{len(matched)} of {len(estimate)} poses have a reference pose within "

@@ -8,7 +8,7 @@ import platform
 import shlex
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -237,6 +237,12 @@ def with_sensors(system: System, sequence: Sequence) -> System:
     return system
 
 
+def _differing(made: Camera, now: Camera) -> str:
+    """In what two cameras differ, but for the noise of their depth: "fx 525.0 and 517.3, ..."."""
+    pairs = ((f.name, getattr(made, f.name), getattr(now, f.name)) for f in fields(Camera))
+    return ", ".join(f"{n} {a} and {b}" for n, a, b in pairs if n != "depth_noise" and a != b)
+
+
 def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSystem) -> System:
     """The system of a new run: empty, or with the map of ``options.map`` or ``localise``.
 
@@ -247,11 +253,10 @@ def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSyste
     if source is None:
         return make_system(sequence.camera, options.config)
     state, camera = read_map(source)
-    cameras = {replace(c, depth_noise=None) for c in (camera, sequence.camera)}
-    if options.map and len(cameras) > 1:
+    if options.map and (differing := _differing(camera, sequence.camera)):
         raise InputError(
-            f"{source}: made with {camera}, but {sequence.folder} has {sequence.camera}; a map "
-            "can only be continued with its own camera (--localise accepts any)"
+            f"{source}: made with another camera than that of {sequence.folder} ({differing}); a "
+            "map can only be continued with its own camera (--localise accepts any)"
         )
     make = MapLocalisation if options.localise else make_system
     system = make(sequence.camera, options.config)

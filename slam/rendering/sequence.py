@@ -161,8 +161,8 @@ def _check(config: RenderConfig) -> None:
             f"rounds={config.rounds}: the path of {config.name!r} does not end where it began; "
             f"only {', '.join(CLOSED)} can be walked more than once"
         )
-    if config.people < 0:
-        raise InputError(f"people={config.people}: must not be negative")
+    if min(config.people, config.seed) < 0:
+        raise InputError(f"people={config.people}, seed={config.seed}: must not be negative")
     if config.carry and not config.people:
         raise InputError("carry: there is nobody to carry anything; ask for people=1")
     if not 0.1 <= config.fps <= 1000:

@@ -91,9 +91,10 @@ def write_film(
     Raises:
         InputError: no run, no images, fewer than two frames with a pose, or no such folder.
     """
+    run = Run(options.run)
     if not options.path.parent.is_dir():
         raise InputError(f"{options.path.parent}: no such folder for the film; make it first")
-    film = _Film(options)
+    film = _Film(options, run)
     film.shoot(progress)
     with whole_file(options.path) as temporary:
         kind = options.path.suffix.lower()
@@ -105,8 +106,8 @@ def write_film(
 class _Film:
     """Shoots frames of a run, and draws the pictures of the film one after the other."""
 
-    def __init__(self, options: FilmOptions) -> None:
-        self._options, self._run = options, Run(options.run)
+    def __init__(self, options: FilmOptions, run: Run) -> None:
+        self._options, self._run = options, run
         folder = options.sequence or find_sequence(options.run)
         has_camera = (options.run / "graph").is_file()
         self._sequence = open_sequence(folder, camera=self._run.camera if has_camera else None)

@@ -232,9 +232,12 @@ def read_scene(run: Path) -> SavedScene:
     """The objects of a run, and where up and the floor are.
 
     Raises:
-        InputError: no such file, a file that `write_objects` did not make, or up has no direction.
+        InputError: no such folder or file, one that `write_objects` did not make, or up has no
+            direction.
     """
     path = run / OBJECTS
+    if not run.is_dir():
+        raise InputError(f"{run}: no such folder; give that of a run that had a segmenter")
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a run that had a segmenter")
     content = read_json(path, _ObjectFile, "run again")

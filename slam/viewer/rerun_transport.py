@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import import_extra
 from bmask_slam.semantics.instances.overlay import class_colour
 from bmask_slam.viewer.options import ViewOptions
@@ -34,7 +35,7 @@ class RerunTransport:
         """Show it as asked for.
 
         Raises:
-            InputError: Rerun is not installed, or the port is taken.
+            InputError: Rerun is not installed, it finds no window's program, or the port is taken.
         """
         self._rr: Any = import_extra("rerun", "the viewer", "view")
         self._viewer: WebViewer | None = None
@@ -47,7 +48,14 @@ class RerunTransport:
             self._viewer = WebViewer(rerun_cli, options.host, options.serve)
             self._stream.connect_grpc(self._viewer.address)
         elif options.window:
-            self._stream.spawn()
+            try:
+                self._stream.spawn()
+            except RuntimeError as error:
+                reason = str(error).partition("\n")[0]
+                raise InputError(
+                    f"the viewer's window does not open ({reason}); activate the environment that "
+                    "Rerun is installed in, or use --serve or --record F.rrd"
+                ) from error
         self._stream.send_blueprint(_blueprint())
         self._log("world", self._rr.ViewCoordinates.RDF, static=True)
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from bmask_slam.graph.whole_file import whole_file, whole_folder
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.whole_file import check_target, whole_file, whole_folder
 
 
 def test_a_link_is_replaced_and_its_target_kept(tmp_path: Path) -> None:
@@ -52,3 +53,15 @@ def test_permissions_are_those_of_any_new_file(tmp_path: Path) -> None:
     with whole_file(tmp_path / "whole") as temporary:
         temporary.write_text("")
     assert (tmp_path / "whole").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_a_folder_in_the_place_of_a_file_is_refused_and_kept(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    with (
+        pytest.raises(InputError, match="a: is a folder; give the name of a file"),
+        whole_file(tmp_path / "a"),
+    ):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+    with pytest.raises(InputError, match="none is not there; make it first"):
+        check_target(tmp_path / "none" / "a")

@@ -65,7 +65,7 @@ class _Folder:
 
 def find_experiment(name: str | Path) -> Path:
     """An experiment's file from its path, or from the bare name of one in ``data/experiments``."""
-    if re.fullmatch(r"[\w-]+", str(name)):
+    if re.fullmatch(r"[\w-]+", str(name)) and not Path(name).is_file():
         return data_path("experiments", f"{name}.yaml")
     return Path(name)
 

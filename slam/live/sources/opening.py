@@ -54,6 +54,13 @@ class SourceOptions:
     sensors: SensorTopics = field(default_factory=SensorTopics)
     node: Node | None = None
 
+    def __post_init__(self) -> None:
+        if self.max_frames is not None and self.max_frames < 1:
+            wrong = f"--max-frames {self.max_frames}"
+            raise InputError(f"{wrong}: must be a whole number of at least 1")
+        if not self.silence_s > 0:
+            raise InputError(f"--silence {self.silence_s:g}: must be more than 0 seconds")
+
 
 def open_source(text: str, options: SourceOptions) -> Source:
     """Open a recording in any layout, a bag, a camera by its name, or ROS 2.

@@ -33,6 +33,11 @@ class Asked:
     other: str = ""
     most: int | None = None
 
+    def __post_init__(self) -> None:
+        if self.near_world is not None and not np.isfinite(self.near_world).all():
+            place = " ".join(f"{value:g}" for value in self.near_world)
+            raise InputError(f"--near {place}: give three finite coordinates in metres")
+
 
 @dataclass(frozen=True, eq=False)
 class Answer:
@@ -71,8 +76,8 @@ def ask(run: Path, asked: Asked) -> Answer:
     """The objects of a run that are asked for.
 
     Raises:
-        InputError: the run has no objects.json, its label set lacks a label, or there is no object
-            of the id that a relation names.
+        InputError: there is no run, it has no objects.json, its label set lacks a label, or there
+            is no object of the id that a relation names.
     """
     scene = read_scene(run)
     counts = dict(sorted(Counter(o.label for o in scene.objects).items()))

@@ -86,6 +86,11 @@ def open_recording(path: Path, camera: Given = None) -> Recording:
             if not path.is_file():
                 raise InputError(f"{path}: is no plain file; give a recording of docs/data.md")
             return layout.open(path, camera)
+    if path.is_file():
+        raise InputError(
+            f"{path}: a file, and no recording of docs/data.md by its name; give the folder that "
+            "holds rgb.txt"
+        )
     if not path.is_dir():
         beside: list[str] = []
         with suppress(OSError):  # no folder either, or one that may not be read

@@ -82,6 +82,17 @@ def test_unknown_tags_are_counted_once(tmp_path: Path, caplog: pytest.LogCapture
     assert "2 lines of the unknown type VERTEX_XY" in messages[0]
 
 
+def test_a_file_of_another_kind_is_not_told_line_by_line(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    text = "".join(f"{k}.5 rgb/{k}.png\n" for k in range(50))
+    with pytest.raises(InputError, match="nothing to optimise"):
+        read_text(tmp_path, text)
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 11
+    assert "40 more unknown types" in messages[-1]
+
+
 def test_the_largest_component_is_used(tmp_path: Path, caplog) -> None:
     def edge(i: int, j: int) -> str:
         return f"EDGE_SE2 {i} {j} {j - i} 0 0 1 0 0 1 0 1\n"

@@ -142,11 +142,14 @@ def test_a_plane_is_fitted_between_pixels_and_an_edge_is_rejected() -> None:
         ({"anchor_sigma_m": 0.0}, "--anchor-sigma 0.0: must be positive"),
         ({"known_distance": (0.1, 99.0, 1.0)}, "--known-distance 0.1 99 1: give two different"),
         ({"sequence": Path("/nowhere")}, "/nowhere: no such folder"),
+        ({"run": Path("/nowhere")}, "/nowhere: no such folder; give the folder of a run"),
     ],
 )
 def test_impossible_options_are_refused(made, tmp_path, changes, words) -> None:
     with pytest.raises(InputError, match=words):
-        calibrate_run(CalibrateOptions(made[1], tmp_path / "camera.yaml", **changes))
+        calibrate_run(
+            CalibrateOptions(**{"run": made[1], "out": tmp_path / "camera.yaml"} | changes)
+        )
     assert not (tmp_path / "camera.yaml").exists()
 
 

@@ -182,6 +182,15 @@ def test_every_shipped_configuration_runs(capsys, sequence: Path, tmp_path: Path
         (["evaluate", "none.txt", "--reference", "seq"], "none.txt: no such file"),
         (["render", "attic", "--out", "x"], "choose one of office"),
         (["render", "office", "--out", "x", "--frames", "0"], "frames=0"),
+        (["render", "office", "--out", "x", "--seed", "-1"], "seed=-1: must not be negative"),
+        (["info", "seq/rgb.txt"], "seq/rgb.txt: a file, and no recording"),
+        (["run", "seq", "--set", "tracking.min_inliers=-3"], "= -3 is negative; give 0 or more"),
+        (["run", "seq", "--set", "graph.relinearize_skip=0"], "= 0: must be at least 1"),
+        (["live", "seq", "--max-frames", "0"], "--max-frames 0: must be a whole number"),
+        (
+            ["evaluate-segmentation", "--data", "x", "--images", "seq", "--plot", "none/a.png"],
+            "none/a.png: the folder none is not there",
+        ),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_no_files(

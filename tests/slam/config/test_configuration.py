@@ -221,6 +221,19 @@ def test_shipped_configurations_are_found_by_name() -> None:
         assert find_config(path.stem) == path
 
 
+def test_a_file_without_a_suffix_is_found(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine").write_text("final_adjustment: false\n")
+    assert not resolve(SystemConfig, find_config("mine")).final_adjustment
+
+
+def test_a_count_below_zero_is_refused() -> None:
+    with pytest.raises(InputError, match=r"features\.max_keypoints = -5 is negative; give 0 or"):
+        resolve(SystemConfig, None, ["features.max_keypoints=-5"])
+    with pytest.raises(InputError, match="relinearize_skip = 0: must be at least 1"):
+        resolve(SystemConfig, None, ["graph.relinearize_skip=0"])
+
+
 def test_an_older_file_is_read_with_the_present_names_of_its_settings(tmp_path: Path) -> None:
     """A file of an older version with the former names and all defaults."""
     older = Path(__file__).with_name("before_renaming.yaml")

@@ -19,6 +19,7 @@ from true_run import FRAMES, make_run
 from bmask_slam.cli import main
 from bmask_slam.dense.folder import LABEL_FILE, DenseFolder
 from bmask_slam.dense.keyframe_input import load_keyframe
+from bmask_slam.dense.map_run import map_run
 from bmask_slam.dense.options import MapOptions
 from bmask_slam.dense.saved_map import MappedRun, open_run
 from bmask_slam.dense.surface import FusedMap, make_surface
@@ -181,6 +182,15 @@ def test_excluded_classes_are_missing_or_in_another_cloud(mapped: Path, tmp_path
     assert (still["label"] == chair).mean() < 0.001
     assert (moving["label"] == chair).mean() > 0.9
     assert len(moving["x"]) > 100
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:99", "meta"])
+def test_a_device_that_is_not_here_is_refused(mapped: Path, tmp_path: Path, device: str) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(mapped, run, ignore=shutil.ignore_patterns("dense"))
+    with pytest.raises(InputError, match=f"--device {device}: not here .* there are: cpu"):
+        map_run(MapOptions(run, device=device))
+    assert not (run / "dense").exists()
 
 
 def test_a_map_of_excluded_classes_alone_is_refused(

@@ -99,6 +99,8 @@ def test_what_makes_no_film_is_refused(run: Path, tmp_path: Path) -> None:
         FilmOptions(run, tmp_path / "film.avi")
     with pytest.raises(InputError, match="1 to 120 seconds"):
         FilmOptions(run, seconds=0.0)
+    with pytest.raises(InputError, match="nowhere: no such folder; give the folder of a run"):
+        write_film(FilmOptions(tmp_path / "nowhere"))
     with pytest.raises(InputError, match="no such folder for the film"):
         write_film(FilmOptions(run, tmp_path / "missing" / "film.gif"))
     with pytest.raises(InputError, match="no such list"):

@@ -109,5 +109,7 @@ def test_what_is_broken_is_named_and_what_is_missing_left_out(run: Path, tmp_pat
 def test_no_run_and_no_folder_are_refused(run: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds no run"):
         write_run_report(tmp_path)
+    with pytest.raises(InputError, match="is a folder; give the name of a file"):
+        write_run_report(run, tmp_path)
     with pytest.raises(InputError, match="no such folder for the report"):
         write_run_report(run, tmp_path / "missing" / "page.html")

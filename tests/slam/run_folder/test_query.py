@@ -248,3 +248,12 @@ def test_the_scene_graph_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert len({tuple(found[c][k] for c in ("red", "green", "blue")) for k in range(8)}) == 4
     with pytest.raises(InputError, match="needs the folder of a run"):
         export(out, "scene-graph", tmp_path.parent / "other.json")
+
+
+def test_no_run_and_no_place_are_refused(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["query", str(tmp_path / "nowhere")]) == 1
+    assert "nowhere: no such folder; give that of a run" in capsys.readouterr().err
+    assert main(["query", str(run), "--near", "1", "2", "nan"]) == 1
+    assert "--near 1 2 nan: give three finite coordinates" in capsys.readouterr().err

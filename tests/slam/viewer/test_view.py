@@ -69,6 +69,20 @@ def test_a_recording_in_a_missing_folder_is_refused(tmp_path) -> None:
         Scene("a", ViewOptions(record=tmp_path / "none" / "a.rrd"))
 
 
+def test_what_cannot_be_shown_leaves_an_earlier_recording(tmp_path, capsys) -> None:
+    file = tmp_path / "a.rrd"
+    file.write_text("precious")
+    assert main(["view", str(tmp_path / "nowhere"), "--record", str(file)]) == 1
+    assert "nowhere: " in capsys.readouterr().err
+    assert file.read_text() == "precious"
+
+
+def test_a_window_without_its_program_is_one_line(monkeypatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(InputError, match=r"window does not open .*--record"):
+        Scene("a", ViewOptions(window=True))
+
+
 def columns(path: Path, entity: str, name: str) -> list[Array]:
     """Rows of one component of an entity in a recording."""
     found = []

@@ -110,6 +110,14 @@ def test_other_names_are_refused(text: str, reason: str) -> None:
         source_of(text)
 
 
+@pytest.mark.parametrize(("name", "value"), [("max_frames", 0), ("silence_s", -1.0)])
+def test_numbers_out_of_range_are_refused(name: str, value: float) -> None:
+    with pytest.raises(
+        InputError, match=f"--{name.removesuffix('_s').replace('_', '-')} {value:g}"
+    ):
+        SourceOptions(**{name: value})
+
+
 def test_live_on_a_bag(recording: Sequence, bag: Path, tmp_path: Path, capsys) -> None:
     assert main(["live", str(bag), "--out", str(tmp_path / "run")]) == 0
     counts = "1 unpaired rgb, 1 duplicates"
