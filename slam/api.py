@@ -185,9 +185,16 @@ def _configuration(
 
 
 def _segmenter_options(given: str | SegmenterOptions, base: SegmenterOptions) -> SegmenterOptions:
-    from bmask_slam.semantics.segmenters.segmenter_table import written  # noqa: PLC0415
+    from bmask_slam.semantics.segmenters import segmenter_table  # noqa: PLC0415
 
-    return replace(base, name=written(given)) if isinstance(given, str) else given
+    if isinstance(given, str):
+        return replace(base, name=segmenter_table.written(given))
+    if not isinstance(given, segmenter_table.SegmenterOptions):
+        raise InputError(
+            f"segmenter: a {type(given).__name__}; give a name, 'module:Class' or SegmenterOptions "
+            "(an object goes to SlamSystem)"
+        )
+    return given
 
 
 def _plain(given: Mapping[str, Any]) -> dict[str, Any]:

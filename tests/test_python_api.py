@@ -99,6 +99,7 @@ def test_every_option_has_a_keyword(keywords: type, options: type, named: set[st
         ({"overwrite": "yes"}, r"overwrite = .*yes.* is not true or false"),
         ({"out": 7}, r"run\(\): out = 7 is not a"),
         ({"segmenter": "lite"}, "'lite': not known; there are: light, .*none"),
+        ({"segmenter": object()}, "segmenter: a object; give a name"),
         ({"config": "no/such.yaml"}, r"no/such\.yaml: "),
         ({"settings": {"tracking.min_inliers": "x"}}, r"tracking\.min_inliers = .*whole number"),
         (
@@ -113,6 +114,15 @@ def test_arguments_of_run_are_checked(
     with pytest.raises(bmask_slam.InputError, match=message):
         bmask_slam.run(recording, **{"out": tmp_path / "out", **options})
     assert not (tmp_path / "out").exists()
+
+
+def test_a_camera_and_a_frame_of_open_sequence_are_checked(recording: Path) -> None:
+    with pytest.raises(bmask_slam.InputError, match="nowhere: no such file; give a camera"):
+        bmask_slam.open_sequence(str(recording), camera="nowhere")
+    sequence = bmask_slam.open_sequence(str(recording), camera=str(recording / "camera.yaml"))
+    for index in (-1, len(sequence)):
+        with pytest.raises(bmask_slam.InputError, match=f"no frame {index}; there are 0 to"):
+            sequence.load(index)
 
 
 def test_arguments_of_map_run_are_checked(tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ def check_picture(path: Path) -> None:
 
 def draw_before_after(path: Path, before: View, after: View) -> None:
     """Write the picture; it appears whole or not at all."""
-    figure = Figure(figsize=(12, 6), layout="constrained")
+    figure = Figure(figsize=(12, 6), layout="compressed")  # squares, with room for titles
     FigureCanvasAgg(figure)
     for k, view in enumerate((before, after), start=1):
         projection = "3d" if view.points.shape[1] == 3 else None

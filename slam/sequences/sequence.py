@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -87,8 +88,10 @@ class Sequence:
         """Decode one frame.
 
         Raises:
-            InputError: its colour or depth image is broken.
+            InputError: its colour or depth image is broken, or there is no such frame.
         """
+        if not 0 <= index < len(self):
+            raise InputError(f"{self.folder}: no frame {index}; there are 0 to {len(self) - 1}")
         depth_m, lag_s = self._depth(index)
         return Frame(
             index,
@@ -160,7 +163,9 @@ class Sequence:
 
 
 def open_sequence(
-    path: Path, config: SequenceConfig | None = None, camera: Path | Camera | None = None
+    path: str | os.PathLike[str],
+    config: SequenceConfig | None = None,
+    camera: str | os.PathLike[str] | Camera | None = None,
 ) -> Sequence:
     """Open a recording in any layout of docs/data.md: TUM's, others' folders, files, ROS bags.
 
@@ -170,7 +175,8 @@ def open_sequence(
     Raises:
         InputError: naming the file, the value and the cure.
     """
-    recording = open_recording(Path(path), camera)
+    given = camera if camera is None or isinstance(camera, Camera) else Path(camera)
+    recording = open_recording(Path(path), given)
     sequence = Sequence(recording, recording.camera, config or SequenceConfig())
     _check_images(sequence)
     truth = sequence.groundtruth is not None

@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from repository import KITCHEN
@@ -18,6 +19,7 @@ from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_exp
 from bmask_slam.graph.smoother.storage import read_graph, write_graph
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
 from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.refinement.adjustment_plot import View, draw_before_after
 from bmask_slam.refinement.carried_along import move_frames
 from bmask_slam.run_folder.map_file import read_map, read_run
 from bmask_slam.system_config import SystemConfig
@@ -216,3 +218,12 @@ def test_impossible_options_are_refused(capsys, kitchen: Path, tmp_path: Path) -
     assert "do not belong together" in error(other, "--out", tmp_path / "new")
     (other / "frames.csv").unlink()
     assert "frames.csv: no such file" in error(other, "--out", tmp_path / "new")
+
+
+def test_titles_are_inside_the_picture(tmp_path: Path) -> None:
+    """The axes are square and as high as the picture allows."""
+    points, edges = np.array([[0.0, 0.0], [-0.2, 3.2]]), np.array([[0, 1]])
+    view = View("before, cost 1351.8", points, [(edges, "tab:blue", 0.9)], axes="xz")
+    draw_before_after(tmp_path / "a.png", view, view)
+    picture = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_GRAYSCALE)
+    assert (picture[:4] > 128).all()
