@@ -7,7 +7,7 @@ the measurements. A keyframe that is culled leaves a gap that the next update cl
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from typing import Protocol
 
@@ -27,6 +27,7 @@ from bmask_slam.graph.factors.graph_update import (
     POSITION,
     SITE,
     RelativePose,
+    RelativePoseName,
 )
 from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.files.array_file import nested, part
@@ -39,7 +40,12 @@ from bmask_slam.graph.sensors.odometry import Motion, motion_between
 from bmask_slam.graph.sensors.streams import Measurements, SensorStreams
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.loops.closing import LoopCloser
-from bmask_slam.sensing.carried_frames import carried_frames, example_state, is_known
+from bmask_slam.sensing.carried_frames import (
+    carried_frames,
+    carried_verdicts,
+    example_state,
+    is_known,
+)
 from bmask_slam.sensing.imu_estimation import MountingEstimator, with_mounting
 from bmask_slam.sensing.inertial_fusion import carried, inertial_update, motion_by_imu, newest_state
 from bmask_slam.sensing.marker_fusion import MarkerFusion
@@ -142,7 +148,8 @@ class SensorFusion:
             and is_known(factor.name, world)
         ]
         found = carried_frames(kept, old, world)
-        self._made = {factor.name: np.nan for factor in found.relative_poses}
+        refused = carried_verdicts(self._made, self._first_keyframe, world)
+        self._made = {factor.name: np.nan for factor in found.relative_poses} | refused
         return found
 
     def begin_session(self, first_keyframe: int) -> None:
@@ -153,11 +160,13 @@ class SensorFusion:
         self.streams, self.refused, self.newest = SensorStreams(), {}, None
         self.imu.begin_session()
         self._first_keyframe = first_keyframe
-        self._made = dict.fromkeys(self._made, np.nan)  # stamps are of the other recording
+        for name in self._made:
+            if name[2] == POSITION:
+                self._made[name] = np.nan  # its stamp is of the other recording
 
     def changes(self, owner: GraphOwner, last: bool = False) -> SensorChanges:
         """The factors that can be made now; ``last``: no further keyframe will come."""
-        if not (self.streams or self.config.planar.enabled):
+        if not (self.streams or self.config.planar.enabled or self.config.markers.has_site):
             return SensorChanges()
         world, history, tables = owner.world, owner.history, owner.smoother.tables
         self._forget_culled(world)
@@ -169,7 +178,7 @@ class SensorFusion:
             moved = SensorChanges(relative_poses=tuple(self._odometry(present)))
             found = found.with_more(moved).with_more(frame.changes())
             found = found.with_more(self._inertial(present, tables))
-            found = found.with_more(self.markers.changes(present, sight, self.streams))
+            found = found.with_more(self.markers.changes(segment, present, sight, self.streams))
             found = found.with_more(planar_changes(present, tables, self._made, self.config.planar))
         return found
 
@@ -218,6 +227,11 @@ class SensorFusion:
         if moved:
             self.markers.tell_moved(found, self._made)
         self._made[found.factor.name] = float(Verdict.MOVED) if moved else np.nan
+
+    def forget(self, names: Iterable[RelativePoseName]) -> None:
+        """Factors are not in the graph any more."""
+        for name in names:
+            self._made.pop(name, None)
 
     def marker_map(self, tables: FactorTables, segment: int) -> MarkerMap:
         """The markers of a map segment."""
