@@ -109,12 +109,13 @@ class SensorFusion:
         late = new.rows[:, 0] < newest_s - self.config.late_s
         if late.any():
             count, until_s = int(late.sum()), new.rows[late, 0][-1]
+            if new.sensor not in self.refused:  # one event, however many calls there are
+                self._events.sensor(
+                    f"{new.sensor}: {count} measurements up to {until_s:.3f} s refused: more than "
+                    f"{self.config.late_s:g} s before the newest keyframe (sensors.late_s)",
+                    logging.WARNING,
+                )
             self.refused[new.sensor] = self.refused.get(new.sensor, 0) + count
-            self._events.sensor(
-                f"{new.sensor}: {count} measurements up to {until_s:.3f} s refused: more than "
-                f"{self.config.late_s:g} s before the newest keyframe (sensors.late_s)",
-                logging.WARNING,
-            )
         if not late.all():
             self.streams.add(Measurements(new.sensor, new.rows[~late]))
 
@@ -160,9 +161,8 @@ class SensorFusion:
         self.streams, self.refused, self.newest = SensorStreams(), {}, None
         self.imu.begin_session()
         self._first_keyframe = first_keyframe
-        for name in self._made:
-            if name[2] == POSITION:
-                self._made[name] = np.nan  # its stamp is of the other recording
+        # stamps of positions are of the other recording
+        self._made = {n: np.nan if n[2] == POSITION else v for n, v in self._made.items()}
 
     def changes(self, owner: GraphOwner, last: bool = False) -> SensorChanges:
         """The factors that can be made now; ``last``: no further keyframe will come."""
@@ -201,7 +201,8 @@ class SensorFusion:
     def follow(self, owner: GraphOwner) -> None:
         """The graph was optimised: keep how the camera moves, for a blackout."""
         if self.streams or owner.smoother.tables.inertial:
-            self.newest = newest_state(owner.world, owner.smoother.tables, self.imu.found)
+            own = [k for k in owner.world.keyframes.values() if k.id >= self._first_keyframe]
+            self.newest = newest_state(own, owner.smoother.tables, self.imu.found)
 
     def _odometry(self, keyframes: list[Keyframe]) -> Iterator[RelativePose]:
         """Motion between keyframes in a row."""
@@ -251,6 +252,8 @@ class SensorFusion:
         """Tell how many factors of each kind do not fit the final estimate."""
         self.markers.report(self.sightings())
         self.imu.report(self.streams)
+        for sensor, count in self.refused.items():
+            self._events.sensor(f"{sensor}: {count} measurements came too late", logging.WARNING)
         for kind in KINDS if self._made else ():
             found = smoother.relative_pose_errors(kind)
             wrong = found.chi2 > chi2_quantile(FIT_PROBABILITY, DEGREES[kind])
@@ -258,8 +261,7 @@ class SensorFusion:
                 worst = found.keyframe_b[int(np.argmax(found.chi2))]
                 self._events.sensor(
                     f"{kind}: {wrong.sum()} of {len(wrong)} do not fit and count for little, the "
-                    f"worst at keyframe {worst}",
-                    logging.INFO,
+                    f"worst at keyframe {worst}"
                 )
 
     def state(self) -> Arrays:
