@@ -135,7 +135,7 @@ class FoundMarker:
 
     Attributes:
         id: its number in the dictionary.
-        size_m: edge of the black square, known or by depth; NaN of one from another recording.
+        size_m: edge of the black square, known or by depth; NaN where neither says it.
         T_world_marker: (4, 4).
         seen, used: number of keyframes that saw it, and of those whose sighting is a factor.
     """
