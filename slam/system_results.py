@@ -86,16 +86,22 @@ class SystemResults(ABC):
         return self.map.history.trajectories(self.map.world)
 
     def keyframe_trajectory(self) -> Trajectory:
-        """The keyframes of the largest segment that this session made."""
+        """The keyframes of the largest segment that this session made.
+
+        In a merged map those of recordings that a run had continued have no stamp, and are left
+        out.
+        """
         chosen = self.map.world.in_segment(largest(self.segments()))
         chosen = [k for k in chosen if k.id >= self._first_keyframe]
+        chosen = [k for k in chosen if np.isfinite(k.timestamp_s)]
         poses = np.array([k.T_world_camera for k in chosen]).reshape(-1, 4, 4)
         return Trajectory(np.array([k.timestamp_s for k in chosen]), poses)
 
     def keyframe_covariances(self) -> KeyframeCovariances:
-        """Covariances of the keyframes of the largest segment."""
+        """Covariances of the keyframes of the largest segment that have a stamp."""
         chosen = self.map.world.in_segment(largest(self.segments()))
-        return find_covariances(self.mapper.smoother, {k.id: k.timestamp_s for k in chosen})
+        stamps_s = {k.id: k.timestamp_s for k in chosen if np.isfinite(k.timestamp_s)}
+        return find_covariances(self.mapper.smoother, stamps_s)
 
     def landmarks(self) -> LandmarkCloud:
         """The landmarks of the largest segment, with their colours."""

@@ -68,8 +68,9 @@ def _linearised(graph: PoseGraph) -> tuple[csr_array, Array]:
     linear = factors.linearize(make_values(graph, graph.poses))
     i, j, entries = linear.sparseJacobian_()
     i, j = i.astype(np.int64) - 1, j.astype(np.int64) - 1
-    right = j == j.max()
+    columns = len(graph.ids) * graph.information.shape[-1]
+    right = j == columns  # no entry at all where every residual is zero
     b = np.zeros(i.max() + 1)
     b[i[right]] = entries[right]
     i, j, entries = i[~right], j[~right], entries[~right]
-    return csr_array((entries, (i, j)), shape=(len(b), j.max() + 1)), b
+    return csr_array((entries, (i, j)), shape=(len(b), columns)), b

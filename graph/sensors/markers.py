@@ -74,6 +74,11 @@ class MarkersConfig:
         if any(not any(row[4:]) for row in self.poses):
             raise InputError("sensors.markers.poses: a rotation of zeros; the last is qw = 1")
 
+    @property
+    def has_site(self) -> bool:
+        """Whether poses of markers are known."""
+        return self.enabled and bool(self.poses)
+
     def size_of(self, number: int) -> float | None:
         """The size of a marker in metres, None where it is not known."""
         return dict(self.sizes_m).get(number, self.size_m)
@@ -130,7 +135,7 @@ class FoundMarker:
 
     Attributes:
         id: its number in the dictionary.
-        size_m: edge of the black square, known or by depth; NaN of one from another recording.
+        size_m: edge of the black square, known or by depth; NaN where neither says it.
         T_world_marker: (4, 4).
         seen, used: number of keyframes that saw it, and of those whose sighting is a factor.
     """

@@ -22,7 +22,7 @@ from bmask_slam.back_end.landmark_management import (
     restore_observations,
 )
 from bmask_slam.back_end.map_backend import add_keyframe
-from bmask_slam.back_end.marker_loops import close_marker_loops
+from bmask_slam.back_end.marker_loops import close_marker_loops, unite_markers
 from bmask_slam.back_end.pruning import MapPruner
 from bmask_slam.back_end.segment_joining import anchors, join_segment
 from bmask_slam.back_end.triangulation import triangulate_landmarks
@@ -169,14 +169,12 @@ class Mapper:
         self.change_graph()
 
     def join(self, segment: int, tracked: Tracked, recognised: Tracked) -> Tracked:
-        """Move a segment into another one in which a frame of it was recognised.
-
-        Returns the frame as tracked in the joined map.
-        """
+        """Move a segment into another one in which a frame of it was recognised; returns that."""
         inliers = len(recognised.landmark_ids)
         self.events.joined(segment, self.world.segment_of(recognised.landmark_ids), inliers)
         joined = join_segment(self.world, segment, tracked, recognised)
         self.rebuild()
+        unite_markers(self)
         return joined
 
     def rebuild(self) -> None:
@@ -255,8 +253,10 @@ class Mapper:
     def change_graph(self, **changes: Any) -> None:
         """An update that moves much of the graph: ISAM2 is iterated until it converges."""
         changes["max_iterations"] = self.loops.config.max_iterations
-        update = replace(self._factor_selector.map_update(self.world), **changes)
-        self._apply(self.smoother.update(update))
+        update = self._factor_selector.map_update(self.world)
+        removed = [*update.remove_keyframes.tolist(), *changes.pop("remove_keyframes", ())]
+        changes["remove_keyframes"] = np.array(removed, np.int64)
+        self._apply(self.smoother.update(replace(update, **changes)))
 
     def _remove_wrong_loops(self, fresh: set[Ends]) -> set[Ends]:
         """Remove loops until all fit the graph, older ones with what they fused; their ends."""

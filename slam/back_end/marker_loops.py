@@ -19,19 +19,25 @@ from bmask_slam.graph.factors.checks import chi2_quantile, mahalanobis
 from bmask_slam.graph.factors.graph_update import (
     LOOP,
     MARKER,
+    RelativePose,
     RelativePoseName,
+    marker_id,
     marker_of,
 )
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.loops.closing import LoopCloser
 from bmask_slam.loops.verification import LoopConstraint
-from bmask_slam.sensing.marker_fusion import PROBABILITY
+from bmask_slam.sensing.marker_fusion import NEWEST, PROBABILITY
 from bmask_slam.sensing.marker_sightings import (
     MIN_SHARED,
+    MarkerSight,
     Sighting,
+    drift_path,
+    has,
     markers_in,
     sightings_of,
+    spread,
 )
 from bmask_slam.sensing.sensor_fusion import SensorFusion
 from bmask_slam.world.world_map import WorldMap
@@ -61,6 +67,7 @@ class MapOwner(Protocol):
 
 def close_marker_loops(mapper: MapOwner) -> None:
     """Close the loops of sightings that wait, or refuse them."""
+    unite_markers(mapper)
     markers, smoother = mapper.sensors.markers, mapper.smoother
     waiting, markers.waiting = markers.waiting, []
     known = smoother.tables.keyframes.ids
@@ -87,6 +94,50 @@ def close_marker_loops(mapper: MapOwner) -> None:
         mapper.events.marker_loop((end, sighting.factor.keyframe_b), sighting.marker, off_m)
     if loops:
         mapper.fuse(loops)
+
+
+def unite_markers(mapper: MapOwner) -> None:
+    """Make one of the markers that two map segments had each, after these were joined.
+
+    It concerns markers of earlier recordings: one that is not where the other segment saw it,
+    farther than the map can have drifted, was moved in between, and its sightings are refused.
+    """
+    tables, world = mapper.smoother.tables, mapper.world
+    for key in markers_in(tables):
+        own, (segment, number) = sightings_of(tables, key), marker_of(key) or (0, 0)
+        here = world.keyframes[own[0].keyframe_b].segment if own else segment
+        home = marker_id(here, number)
+        if home == key or not has(tables, home):
+            continue
+        sightings = [_seen_elsewhere(mapper, f, home) for f in own]
+        fitting = [_fits(mapper, s) for s in sightings]
+        moved = 2 * sum(fitting) < len(fitting)
+        mapper.sensors.forget(f.name for f in own)
+        for sighting in sightings:
+            mapper.sensors.keep_verdict(sighting, moved)
+        kept = () if moved else tuple(s.factor for s in sightings)
+        mapper.change_graph(remove_keyframes=np.array([key]), relative_poses=kept)
+
+
+def _seen_elsewhere(mapper: MapOwner, factor: RelativePose, home: int) -> Sighting:
+    """A sighting as one of the same marker in another segment."""
+    (T_world_marker,) = mapper.smoother.tables.keyframes.get(np.array([home]))
+    T_world_camera = mapper.world.keyframes[factor.keyframe_b].T_world_camera
+    error = se3_log(inverse(factor.T_a_b) @ inverse(T_world_marker) @ T_world_camera)
+    return Sighting(replace(factor, keyframe_a=home), np.nan, np.nan, error)
+
+
+def _fits(mapper: MapOwner, sighting: Sighting) -> bool:
+    """Whether a marker is where it was seen before, as far as the map is certain of that."""
+    tables, factor = mapper.smoother.tables, sighting.factor
+    earlier = sightings_of(tables, factor.keyframe_a)
+    if not earlier:
+        return True
+    sight = MarkerSight(mapper.world, tables, mapper.loops.noise, {})
+    path = drift_path(sight, factor.keyframe_b, [f.keyframe_b for f in earlier])
+    S = factor.covariance + spread(earlier[-NEWEST:], factor.T_a_b)
+    S = S + mapper.loops.noise.map_covariances(path)
+    return bool(mahalanobis(sighting.error[None], S[None])[0] <= chi2_quantile(PROBABILITY, 6))
 
 
 def _older_end(mapper: MapOwner, sighting: Sighting) -> int:
@@ -163,4 +214,5 @@ def join_by_markers(mapper: MapOwner, segment: int) -> Array | None:
     move_segment(mapper.world, segment, T_other_segment, target)
     mapper.rebuild()
     mapper.fuse([LoopConstraint(older, newer, np.eye(4), np.eye(6), 0, 1.0, no_pairs())])
+    unite_markers(mapper)
     return T_other_segment

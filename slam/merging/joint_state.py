@@ -18,6 +18,7 @@ from bmask_slam.graph.factors.graph_update import (
     FIRST_FRAME,
     FRAMES_OF_A_KIND,
     MARGINAL,
+    MARKER,
     MARKERS_OF_A_SEGMENT,
     PosePrior,
     marker_id,
@@ -25,6 +26,7 @@ from bmask_slam.graph.factors.graph_update import (
 )
 from bmask_slam.graph.files.array_file import part
 from bmask_slam.sensing.reference_frame import RETIRED_FRAME
+from bmask_slam.sensing.sensor_fusion import KINDS
 
 _MADE_BY_GRAPH = (PosePrior.kind, ANCHOR, MARGINAL)
 """Kinds of factors that a graph makes anew."""
@@ -229,7 +231,11 @@ def _inertial(graphs: Sequence[Arrays], shifts: Sequence[Shift]) -> Arrays:
 
 
 def _sensors(states: Sequence[Arrays], shifts: Sequence[Shift]) -> Arrays:
-    """Which factors of sensors there are; their measurements are gone, as in another session."""
+    """Which factors of sensors there are, and what was found of markers' sizes.
+
+    Their measurements are gone, as in another session.
+    """
+    having = [state for state in states if "mapper.sensors.made" in state]
     made = [
         np.c_[state["mapper.sensors.made"][:, :1], s.pose(state["mapper.sensors.made"][:, 1:])]
         for state, s in zip(states, shifts, strict=True)
@@ -239,5 +245,17 @@ def _sensors(states: Sequence[Arrays], shifts: Sequence[Shift]) -> Arrays:
         return {}
     following = shifts[-1].keyframes + int(states[-1]["mapper.world.next_keyframe_id"])
     found: Arrays = {"first_keyframe": np.array(following), "made": np.concatenate(made)}
-    found["made_s"] = np.full(len(found["made"]), np.nan)
+    found["made_s"] = np.concatenate([_verdicts(state) for state in having])
+    sizes = np.concatenate([state["mapper.sensors.marker_sizes"] for state in having])
+    numbers, of = np.unique(sizes[:, 0], return_inverse=True)
+    found["marker_sizes"] = np.zeros((len(numbers), 3))
+    np.add.at(found["marker_sizes"], of, sizes * [0.0, 1.0, 1.0])
+    found["marker_sizes"][:, 0] = numbers
     return {f"mapper.sensors.{name}": array for name, array in found.items()}
+
+
+def _verdicts(state: Arrays) -> Array:
+    """Of each factor NaN, or why a marker's sighting is none; stamps of positions are left out."""
+    kinds = state["mapper.sensors.made"][:, 0]
+    is_sighting = kinds == KINDS.index(MARKER)
+    return np.where(is_sighting, state["mapper.sensors.made_s"], np.nan)

@@ -14,6 +14,7 @@ from bmask_slam.events import Event, read_events
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import NO_DEPTH_DISTORTION, Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.graph_update import marker_id, site_id
 from bmask_slam.graph.files.reading import read_table
 from bmask_slam.merging.joint_state import Shift
 from bmask_slam.run_folder.folder import CHECKPOINT
@@ -61,6 +62,12 @@ class Source:
         """The names of the labels of things, how they were measured, and those of surfaces."""
         names = ("names", "measured", "surfaces.names")
         return tuple(self.state.get(f"semantics.{name}", np.array([""])).tolist() for name in names)
+
+    @property
+    def has_markers(self) -> bool:
+        """Whether fiducial markers are in its graph."""
+        ids = self.state["mapper.graph.keyframe_ids"]
+        return bool(((ids >= marker_id(0, 0)) & (ids < site_id(0))).any())
 
     def frame_rows(self) -> Iterator[dict[str, object]]:
         """The lines of frames.csv, as they are in the merged run's."""
@@ -111,7 +118,7 @@ def read_sources(paths: Sequence[Path]) -> list[Source]:
     labelled = [source for source in found if len(source.labels[0]) > 1]
     for source in labelled[1:]:
         _check_labels(labelled[0], source)
-    return found
+    return _with_markers(found)
 
 
 def _read_source(path: Path, before: Source | None) -> Source:
@@ -190,6 +197,26 @@ def _check_labels(first: Source, other: Source) -> None:
             f"{other.path}: made with another segmenter than {first.path}, so that their labels "
             "differ; run one of them again with the other's, or with --segmenter none"
         )
+
+
+def _with_markers(found: list[Source]) -> list[Source]:
+    """The runs, of which the first has the settings of markers of one that has markers.
+
+    Raises InputError for markers of several dictionaries: the same number is another marker there.
+    """
+    having = [source for source in found if source.has_markers]
+    for source in having[1:]:
+        ours, theirs = (s.config.sensors.markers.dictionary for s in (having[0], source))
+        if ours != theirs:
+            raise InputError(
+                f"{source.path}: made with markers of {theirs}, and {having[0].path} with those of "
+                f"{ours}; their numbers would be mixed up, run one of them again without --markers"
+            )
+    if not having or found[0].has_markers:
+        return found
+    markers = having[0].config.sensors.markers
+    config = replace(found[0].config, sensors=replace(found[0].config.sensors, markers=markers))
+    return [replace(found[0], config=config), *found[1:]]
 
 
 def _without_foreign_stamps(state: Arrays) -> Arrays:

@@ -16,6 +16,7 @@ from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import (
     FIRST_FRAME,
     FRAMES_OF_A_KIND,
+    MARKER,
     PosePrior,
     RelativePose,
     RelativePoseName,
@@ -27,7 +28,13 @@ from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.files.array_file import nested
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.sensors.streams import COLUMNS
-from bmask_slam.sensing.reference_frame import RETIRED_FRAME, SIGMA_M, SIGMA_RAD, SensorChanges
+from bmask_slam.sensing.reference_frame import (
+    RETIRED_FRAME,
+    SIGMA_M,
+    SIGMA_RAD,
+    Made,
+    SensorChanges,
+)
 from bmask_slam.world.world_map import WorldMap
 
 
@@ -37,7 +44,8 @@ def carried_frames(
     """Factors of another graph for a new one, with reference frames where their keyframes are now.
 
     A frame whose segment is no more gets an id that no segment has; markers are those of the
-    segment in which their keyframes are.
+    segment in which their keyframes are. Where that has the same marker already, the other one
+    keeps its id until `back_end.marker_loops.unite_markers` has compared their places.
     """
     segments = {k.segment for k in world.keyframes.values()}
     pairs = [(f.keyframe_a, f.keyframe_b) for f in factors if f.keyframe_a >= FIRST_FRAME]
@@ -45,12 +53,14 @@ def carried_frames(
     free = max([RETIRED_FRAME, *(a + 1 for a, _ in pairs if a < planes)])
     ids: dict[int, int] = {}
     poses: dict[int, Array] = {}
-    for frame, keyframe in sorted(dict(pairs).items()):
-        marker, segment = marker_of(frame), (frame - FIRST_FRAME) % FRAMES_OF_A_KIND
+    homes = {a: _marker_where(a, world.keyframes[b].segment) for a, b in pairs}
+    markers_in_place_first = sorted(dict(pairs).items(), key=lambda p: (homes[p[0]] != p[0], p))
+    for frame, keyframe in markers_in_place_first:
+        segment, home = (frame - FIRST_FRAME) % FRAMES_OF_A_KIND, homes[frame]
         stays = segment in segments or RETIRED_FRAME <= frame < planes
         ids[frame] = frame if stays else free
-        if marker is not None:
-            ids[frame] = marker_id(world.keyframes[keyframe].segment, marker[1])
+        if marker_of(frame) is not None:
+            ids[frame] = frame if home in ids.values() else home
         free += ids[frame] == free
         T_old, T_frame = old.keyframes.get(np.array([keyframe, frame]))
         poses.setdefault(
@@ -64,6 +74,21 @@ def carried_frames(
         tuple(PosePrior(i, T, covariance) for i, T in held),
         tuple(replace(f, keyframe_a=ids.get(f.keyframe_a, f.keyframe_a)) for f in factors),
     )
+
+
+def _marker_where(frame: int, segment: int) -> int:
+    """The id that a marker has in a map segment; other frames keep theirs."""
+    marker = marker_of(frame)
+    return frame if marker is None else marker_id(segment, marker[1])
+
+
+def carried_verdicts(made: Made, first_keyframe: int, world: WorldMap) -> Made:
+    """Refused sightings of markers by keyframes of earlier recordings, with the markers' ids."""
+    return {
+        (_marker_where(a, world.keyframes[b].segment), b, kind): verdict
+        for (a, b, kind), verdict in made.items()
+        if kind == MARKER and not np.isnan(verdict) and b < first_keyframe and b in world.keyframes
+    }
 
 
 def example_state() -> Arrays:

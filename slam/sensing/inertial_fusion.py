@@ -104,16 +104,18 @@ def _restarts(
     return found
 
 
-def newest_state(world: WorldMap, tables: FactorTables, mounting: Array) -> InertialState | None:
-    """What the graph knows of the motion at the newest keyframe that an IMU led to.
+def newest_state(
+    keyframes: Sequence[Keyframe], tables: FactorTables, mounting: Array
+) -> InertialState | None:
+    """What the graph knows of the motion at the newest of these keyframes that an IMU led to.
 
     ``mounting`` (8,) and the delay, where they were estimated; else empty.
     """
     inertial = tables.inertial
-    known = [k for k in inertial.states if k in world.keyframes]
+    known = [k for k in keyframes if k.id in inertial.states]
     if not known:
         return None
-    keyframe = world.keyframes[max(known)]
+    keyframe = max(known, key=lambda k: k.id)
     state, down = inertial.states[keyframe.id], inertial.down.get(keyframe.segment)
     if down is None:
         return None

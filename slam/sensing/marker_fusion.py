@@ -75,13 +75,16 @@ class MarkerFusion:
         self._events = events
 
     def changes(
-        self, keyframes: Sequence[Keyframe], sight: MarkerSight, streams: SensorStreams
+        self,
+        segment: int,
+        keyframes: Sequence[Keyframe],
+        sight: MarkerSight,
+        streams: SensorStreams,
     ) -> SensorChanges:
-        """The factors of a segment's keyframes that can be made now."""
-        rows = streams.of("markers")
-        if not self.config.enabled or not len(rows) or not keyframes:
+        """The factors of a segment that can be made now: of its new keyframes, and known poses."""
+        if not self.config.enabled:
             return SensorChanges()
-        segment, factors = keyframes[0].segment, []
+        rows, factors = streams.of("markers"), []
         begun: dict[int, Array] = {}
         self.waiting = [s for s in self.waiting if s.factor.keyframe_b in sight.world.keyframes]
         for keyframe, row in of_keyframes(keyframes, rows):

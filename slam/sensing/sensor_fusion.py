@@ -7,7 +7,7 @@ the measurements. A keyframe that is culled leaves a gap that the next update cl
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from typing import Protocol
 
@@ -27,6 +27,7 @@ from bmask_slam.graph.factors.graph_update import (
     POSITION,
     SITE,
     RelativePose,
+    RelativePoseName,
 )
 from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.files.array_file import nested, part
@@ -39,7 +40,12 @@ from bmask_slam.graph.sensors.odometry import Motion, motion_between
 from bmask_slam.graph.sensors.streams import Measurements, SensorStreams
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.loops.closing import LoopCloser
-from bmask_slam.sensing.carried_frames import carried_frames, example_state, is_known
+from bmask_slam.sensing.carried_frames import (
+    carried_frames,
+    carried_verdicts,
+    example_state,
+    is_known,
+)
 from bmask_slam.sensing.imu_estimation import MountingEstimator, with_mounting
 from bmask_slam.sensing.inertial_fusion import carried, inertial_update, motion_by_imu, newest_state
 from bmask_slam.sensing.marker_fusion import MarkerFusion
@@ -103,12 +109,13 @@ class SensorFusion:
         late = new.rows[:, 0] < newest_s - self.config.late_s
         if late.any():
             count, until_s = int(late.sum()), new.rows[late, 0][-1]
+            if new.sensor not in self.refused:  # one event, however many calls there are
+                self._events.sensor(
+                    f"{new.sensor}: {count} measurements up to {until_s:.3f} s refused: more than "
+                    f"{self.config.late_s:g} s before the newest keyframe (sensors.late_s)",
+                    logging.WARNING,
+                )
             self.refused[new.sensor] = self.refused.get(new.sensor, 0) + count
-            self._events.sensor(
-                f"{new.sensor}: {count} measurements up to {until_s:.3f} s refused: more than "
-                f"{self.config.late_s:g} s before the newest keyframe (sensors.late_s)",
-                logging.WARNING,
-            )
         if not late.all():
             self.streams.add(Measurements(new.sensor, new.rows[~late]))
 
@@ -142,7 +149,8 @@ class SensorFusion:
             and is_known(factor.name, world)
         ]
         found = carried_frames(kept, old, world)
-        self._made = {factor.name: np.nan for factor in found.relative_poses}
+        refused = carried_verdicts(self._made, self._first_keyframe, world)
+        self._made = {factor.name: np.nan for factor in found.relative_poses} | refused
         return found
 
     def begin_session(self, first_keyframe: int) -> None:
@@ -153,11 +161,12 @@ class SensorFusion:
         self.streams, self.refused, self.newest = SensorStreams(), {}, None
         self.imu.begin_session()
         self._first_keyframe = first_keyframe
-        self._made = dict.fromkeys(self._made, np.nan)  # stamps are of the other recording
+        # stamps of positions are of the other recording
+        self._made = {n: np.nan if n[2] == POSITION else v for n, v in self._made.items()}
 
     def changes(self, owner: GraphOwner, last: bool = False) -> SensorChanges:
         """The factors that can be made now; ``last``: no further keyframe will come."""
-        if not (self.streams or self.config.planar.enabled):
+        if not (self.streams or self.config.planar.enabled or self.config.markers.has_site):
             return SensorChanges()
         world, history, tables = owner.world, owner.history, owner.smoother.tables
         self._forget_culled(world)
@@ -169,7 +178,7 @@ class SensorFusion:
             moved = SensorChanges(relative_poses=tuple(self._odometry(present)))
             found = found.with_more(moved).with_more(frame.changes())
             found = found.with_more(self._inertial(present, tables))
-            found = found.with_more(self.markers.changes(present, sight, self.streams))
+            found = found.with_more(self.markers.changes(segment, present, sight, self.streams))
             found = found.with_more(planar_changes(present, tables, self._made, self.config.planar))
         return found
 
@@ -192,7 +201,8 @@ class SensorFusion:
     def follow(self, owner: GraphOwner) -> None:
         """The graph was optimised: keep how the camera moves, for a blackout."""
         if self.streams or owner.smoother.tables.inertial:
-            self.newest = newest_state(owner.world, owner.smoother.tables, self.imu.found)
+            own = [k for k in owner.world.keyframes.values() if k.id >= self._first_keyframe]
+            self.newest = newest_state(own, owner.smoother.tables, self.imu.found)
 
     def _odometry(self, keyframes: list[Keyframe]) -> Iterator[RelativePose]:
         """Motion between keyframes in a row."""
@@ -219,6 +229,11 @@ class SensorFusion:
             self.markers.tell_moved(found, self._made)
         self._made[found.factor.name] = float(Verdict.MOVED) if moved else np.nan
 
+    def forget(self, names: Iterable[RelativePoseName]) -> None:
+        """Factors are not in the graph any more."""
+        for name in names:
+            self._made.pop(name, None)
+
     def marker_map(self, tables: FactorTables, segment: int) -> MarkerMap:
         """The markers of a map segment."""
         return self.markers.map(tables, segment, self.sightings())
@@ -237,6 +252,8 @@ class SensorFusion:
         """Tell how many factors of each kind do not fit the final estimate."""
         self.markers.report(self.sightings())
         self.imu.report(self.streams)
+        for sensor, count in self.refused.items():
+            self._events.sensor(f"{sensor}: {count} measurements came too late", logging.WARNING)
         for kind in KINDS if self._made else ():
             found = smoother.relative_pose_errors(kind)
             wrong = found.chi2 > chi2_quantile(FIT_PROBABILITY, DEGREES[kind])
@@ -244,8 +261,7 @@ class SensorFusion:
                 worst = found.keyframe_b[int(np.argmax(found.chi2))]
                 self._events.sensor(
                     f"{kind}: {wrong.sum()} of {len(wrong)} do not fit and count for little, the "
-                    f"worst at keyframe {worst}",
-                    logging.INFO,
+                    f"worst at keyframe {worst}"
                 )
 
     def state(self) -> Arrays:

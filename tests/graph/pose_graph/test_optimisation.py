@@ -10,13 +10,13 @@ from repository import SHARED
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.gnc import truncated_weights
 from bmask_slam.graph.g2o.pose_graphs import read_g2o
-from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, se3_log
 from bmask_slam.graph.pose_graph import optimisation
 from bmask_slam.graph.pose_graph.certificate import certify
 from bmask_slam.graph.pose_graph.chordal import chordal_poses
 from bmask_slam.graph.pose_graph.factors import pose_graph_cost
 from bmask_slam.graph.pose_graph.loop_consistency import loop_consistency
-from bmask_slam.graph.pose_graph.loop_prediction import predicted_chi2
+from bmask_slam.graph.pose_graph.loop_prediction import pose_draws, predicted_chi2
 from bmask_slam.graph.pose_graph.optimisation import PoseGraphConfig, optimise_pose_graph
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, planar_poses, spanning_tree_poses
 from bmask_slam.graph.pose_graph.solver import PoseGraphSolver
@@ -220,6 +220,19 @@ def far_loops(graph: PoseGraph) -> PoseGraph:
     keep[loops[:PER_LAP]] = True
     keep[loops[PER_LAP::9]] = True
     return graph.with_edges(keep)
+
+
+def test_edges_without_any_error_are_predicted_to_cost_nothing() -> None:
+    """Exact in floating point: GTSAM's sparse system has no entry for the right-hand side then."""
+    T = make_pose(np.eye(3), np.array([[k % 6, k // 6, 0.0] for k in range(12)]))
+    edges = np.array([*((k, k + 1) for k in range(11)), (0, 6), (0, 11)])
+    information = np.tile(100.0 * np.eye(6), (len(edges), 1, 1))
+    measurements = inverse(T[edges[:, 0]]) @ T[edges[:, 1]]
+    fixed = np.zeros(len(T), bool)
+    graph = PoseGraph(np.arange(12), T, edges, measurements, information, fixed)
+    used = np.arange(len(edges)) < 11
+    np.testing.assert_array_equal(predicted_chi2(graph, used, np.array([11, 12])), 0.0)
+    assert pose_draws(graph, used).shape == (100, 12, 6)
 
 
 @BOTH

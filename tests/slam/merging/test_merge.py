@@ -131,6 +131,33 @@ def test_the_map_is_tracked_in_from_both_walks(merged: MergeSummary) -> None:
     assert result.T_world_camera == pytest.approx(expected, abs=0.01)
 
 
+def test_a_run_that_continued_another_is_merged(runs: Path, tmp_path: Path) -> None:
+    """Keyframes of the recording that it continued are of another clock: they have no stamp."""
+    state, camera = read_map(runs / "first")
+    system = SlamSystem(camera, SystemConfig(keyframes=OFTEN, covariances=True))
+    system.restore(state, runs / "first")
+    system.begin_session()
+    with pytest.MonkeyPatch.context() as patch, RunFolder(tmp_path / "continued") as run:
+        patch.setattr(plot, "plot_trajectory", lambda path, *_: path.write_text("quick"))
+        run.write_text("config.yaml", f"# bmask-slam 0, live\n{dump(system.config)}")
+        for index, T in enumerate(sideways_path(np.linspace(-1.5, -0.4, 12))):
+            run.write_frame(system.process(render_plane(T, index)))
+        system.finish()
+        metrics.save(system, run, [], None, "continued")
+        own = len(system.keyframe_trajectory())
+        done = merge_runs(MergeOptions((run.path, runs / "second"), tmp_path / "both"))
+    both, keyframes = Run(done.folder), len(Run(runs / "second").keyframes)
+    assert len(both.trajectory) == 24
+    assert len(both.keyframes) == own + keyframes
+    assert np.isfinite(both.keyframes.timestamps_s).all()
+    kept = len(Run(runs / "first").keyframes) + own + keyframes
+    assert both.metrics["keyframes"].value == kept
+    assert np.isfinite(both.keyframe_covariances).all()
+    true = inverse(WALKS["first"][0]) @ np.array(WALKS["second"])
+    found = read_tum(done.folder / "trajectory_run_2.txt").poses_world_camera
+    assert np.abs(se3_log(inverse(true) @ found)).max() < 0.01
+
+
 def test_a_run_without_a_common_place_is_named(runs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(InputError, match=r"far: has no place in common with the other runs"):

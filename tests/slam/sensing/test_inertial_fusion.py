@@ -122,6 +122,22 @@ def test_a_restored_system_goes_on_identically_with_an_imu(
         np.testing.assert_array_equal(first[name], second[name], name)
 
 
+def test_how_the_camera_moved_in_an_earlier_recording_is_not_gone_on_with() -> None:
+    """The next one may have the same stamps; until its own IMU says more, nothing is known."""
+    system = with_imu(readings())
+    run(system, range(18))
+    assert system.mapper.sensors.newest is not None
+    first = system.mapper.world.next_keyframe_id
+    system.begin_session()
+    rows = readings()
+    system.add_imu(rows[:, 0], rows[:, 1:4], rows[:, 4:])
+    for k in range(4):
+        run(system, range(k, k + 1))
+        newest = system.mapper.sensors.newest
+        assert newest is None or newest.keyframe >= first
+    assert system.mapper.world.next_keyframe_id > first
+
+
 def test_a_saved_graph_has_the_imu_and_loses_it_with_its_keyframes(
     bridged: tuple[SlamSystem, SlamSystem, list[FrameResult]], tmp_path: Path
 ) -> None:

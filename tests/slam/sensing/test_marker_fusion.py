@@ -26,6 +26,7 @@ from bmask_slam.graph.geometry import (
 from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.graph.sensors.markers import CORNERS, MarkersConfig
 from bmask_slam.graph.sensors.streams import Measurements
+from bmask_slam.sensing.marker_sightings import WORDS, Verdict
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 
 SIGMA = 0.15 / 525
@@ -274,6 +275,35 @@ def test_a_state_and_a_graph_that_is_built_anew_keep_the_markers(six: Walk) -> N
     assert [(m.id, m.used) for m in after] == [(4, 6), (9, 6)]
     for old, new in zip(before, after, strict=True):
         np.testing.assert_allclose(old.T_world_marker, new.T_world_marker, atol=3e-3)
+
+
+def test_a_refused_sighting_stays_refused_in_the_next_recording() -> None:
+    """Also where the graph is built anew."""
+    walk = Walk()
+    for k in range(4):
+        walk.step(pose(k), PLACES)
+    walk.step(pose(4), {4: PLACES[4] @ make_pose(np.eye(3), np.array([0.15, 0.0, 0.0]))})
+    before = walk.mapper.sensors.sightings()
+    assert before[marker_id(0, 4)] == {"used": 4, WORDS[Verdict.MOVED]: 1}
+    walk.mapper.begin_session()
+    assert walk.mapper.sensors.sightings() == before
+    walk.mapper.rebuild()
+    assert walk.mapper.sensors.sightings() == before
+
+
+def test_known_poses_hold_in_the_next_recording_too() -> None:
+    """The graph is built anew, and no marker was seen again."""
+    row = (4, *PLACES[4][:3, 3].tolist(), *quaternion_from_rotation(PLACES[4][None, :3, :3])[0])
+    walk = Walk(MarkersConfig(enabled=True, size_m=SIZE_M, poses=(row,)))
+    for k in range(3):
+        walk.step(pose(k), PLACES)
+    walk.mapper.begin_session()
+    walk.mapper.rebuild()
+    tables = walk.mapper.smoother.tables
+    assert len(tables.relative_poses(SITE)) == 1
+    found = walk.mapper.sensors.marker_map(tables, 0).T_world_site
+    assert found is not None
+    assert np.abs(se3_log(found)).max() < 0.03
 
 
 def test_the_ids_of_markers_are_those_of_nothing_else() -> None:

@@ -10,6 +10,7 @@ import pytest
 from synthetic_view import CAMERA, render_or_black
 
 from bmask_slam.config.configuration import resolve
+from bmask_slam.events import EventKind
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.graph_update import reference_frame_id
@@ -159,6 +160,21 @@ def test_measurements_may_come_late_but_not_too_late() -> None:
     assert system.mapper.sensors.refused == {"odometry": 1}
     assert len(system.mapper.smoother.relative_poses("odometry")) >= 3
     assert not events  # they were told with the frame before
+
+
+def test_measurements_that_come_too_late_one_by_one_are_told_twice() -> None:
+    """The first time, and how many there were at the end."""
+    config = replace(CONFIG, sensors=replace(CONFIG.sensors, late_s=0.1))
+    system = SlamSystem(CAMERA, config)
+    dark_run(system, 5)
+    stamps_s, T = odometry()
+    for k in range(20):
+        system.add_odometry(float(stamps_s[0]) - 1.0 + 0.01 * k, T[0])
+    told = [e.text for e in system.process(FRAMES[5]).events if e.kind is EventKind.SENSOR]
+    assert len(told) == 1
+    assert "1 measurements up to -1.000 s refused" in told[0]
+    system.finish()
+    assert "odometry: 20 measurements came too late" in [e.text for e in system.events.take()]
 
 
 def test_a_second_recordings_measurements_are_of_its_own_keyframes() -> None:
