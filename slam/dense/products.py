@@ -14,6 +14,7 @@ from bmask_slam.dense.surface import FusedMap, frames_a_keyframe, make_surface
 from bmask_slam.graph.arrays import Array, Floats, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import fitting
 from bmask_slam.graph.files.file_names import file_stem
 from bmask_slam.graph.geometry import make_pose
 from bmask_slam.graph.whole_file import remove
@@ -160,9 +161,10 @@ class KeyframeEvidence:
         fused = self._fused
         store_config = run_semantics(fused.run.path).labels
         prior, rows = store_config.prior(len(fused.labels)), []
-        for one in self._all:
-            distributions, known = fused.run.label_distributions(one.landmark_ids, fused.labels)
-            rows.append(one.with_landmarks(distributions, known, prior))
+        for one, keyframe in zip(self._all, self.keyframes, strict=True):
+            with fitting(fused.folder.path / "labels" / f"{keyframe.id:06d}"):
+                distributions, known = fused.run.label_distributions(one.landmark_ids, fused.labels)
+                rows.append(one.with_landmarks(distributions, known, prior))
         names: tuple[str, ...] = next(filter(None, (e.stuff_names for e in self._all)), ())
         stuff = StuffFusion.of(fused.labels.names, names, ground)
         return LabelTable.of(rows, store_config, [e.stuff_of(names) for e in self._all], stuff)
@@ -224,9 +226,10 @@ def _write_excluded(fused: FusedMap, evidence: KeyframeEvidence, table: LabelTab
                 continue
             points, normals = submap.placed(keyframe.T_world_camera)
             rows = np.arange(len(points)), submap.instances.astype(np.int64) + first
-            on = csr_matrix(
-                (np.ones(len(points), np.float32), rows), (len(points), len(table.submaps))
-            )
+            with fitting(path / f"{keyframe.id:06d}"):
+                on = csr_matrix(
+                    (np.ones(len(points), np.float32), rows), (len(points), len(table.submaps))
+                )
             labels = table.labels(on, points, normals)
             sigmas_m = np.sqrt(submap.variances)
             one = np.ones(len(points), np.uint16)
