@@ -26,7 +26,7 @@ from bmask_slam.dense.surface import FusedMap, make_surface
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested, read_arrays, write_arrays
-from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.files.ply import read_ply, write_ply
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.mapping.products.cloud import Cloud
@@ -504,3 +504,19 @@ def test_excluded_points_of_an_instance_that_is_not_there_are_refused(
     write_submap(path, replace(submap, instances=np.full_like(submap.instances, 60000)))
     assert main(arguments) == 1
     assert f"moving/{path.name}: its arrays do not fit together" in capsys.readouterr().err
+
+
+def test_a_map_to_drive_on_that_is_too_large_by_a_few_points_is_refused(
+    mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(mapped, run)
+    arguments = ["export", str(run), "--format", "nav2", "--out", str(tmp_path / "map.yaml")]
+    assert main(arguments) == 0
+    cloud = read_ply(run / "dense" / "cloud.ply")
+    for rows, place in ((slice(-3, None), (1000.0, 0, 0)), (slice(-6, -3), (0, 0, 1000.0))):
+        for axis, value in zip("xyz", place, strict=True):
+            cloud[axis][rows] = value
+    write_ply(run / "dense" / "cloud.ply", cloud)
+    assert main(arguments) == 1
+    assert "m large; choose a larger --resolution" in capsys.readouterr().err
