@@ -31,6 +31,7 @@ from bmask_slam.live.processes.dense_messages import (
     LateMasks,
     MapPoses,
     RemoveKeyframes,
+    RunMoved,
     ShowSurface,
 )
 from bmask_slam.live.processes.dense_process import DenseServer
@@ -239,6 +240,16 @@ def test_after_a_full_disk_the_surface_is_begun_again(small_disk, caplog, monkey
     assert "the surface is made of keyframes alone" in caplog.text
     assert (grown.frames, grown.surface.views.max()) == (0, KEYFRAMES)
     server.growing._end()  # the disk is unmounted
+
+
+def test_a_surface_that_is_begun_after_the_run_folder_was_renamed_has_its_frames(tmp_path) -> None:
+    """As that of the last process, which is made at the end, or that after a full disk."""
+    server = with_keyframes(make_server(tmp_path / "run"))
+    server.handle(between())
+    (tmp_path / "run").rename(tmp_path / "renamed")
+    server.handle(RunMoved(tmp_path / "renamed"))
+    grown = server.growing.finish()
+    assert (grown.frames, grown.surface.views.max()) == (1, KEYFRAMES + 1)
 
 
 # --- which frames --------------------------------------------------------------------------------
