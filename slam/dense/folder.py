@@ -63,8 +63,8 @@ _NO_EVIDENCE = InstanceEvidence(
     np.zeros((0, 0), np.float32), np.zeros(0, np.int64), np.zeros(0, np.uint16)
 )
 NewIds = Callable[[Ints], Ints]
-PARTS = ("depth", "colours", "moving", "labels")
-OLD_PARTS = ("submaps", "volume", "frames")
+PARTS, FRAMES = ("depth", "colours", "moving", "labels"), "frames"
+OLD_PARTS = ("submaps", "volume", FRAMES)
 METHOD = 4
 """Version of the method; to be raised when the same settings give other submaps than before."""
 

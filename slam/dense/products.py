@@ -47,6 +47,13 @@ OVERVIEW_OFFSET_M = np.array([0.0, -0.6, -1.0])
 OVERVIEW_TILT_DEG = -20.0
 """The overview is taken from behind and above a keyframe, tilted down."""
 
+VIEWS = ("first", "middle", "overview")
+SOMETIMES = (
+    *("semantic.ply", "semantic.pcd", "moving.ply", "moving.pcd", "mesh.ply", "mesh.glb"),
+    *("plan.png", "view_mesh.png", *(f"view_{name}_semantic.png" for name in VIEWS)),
+)
+"""Products that are not made of every map."""
+
 
 @dataclass(frozen=True, eq=False)
 class GrownSurface:
@@ -111,6 +118,8 @@ def write_products(
         written.append(write_picture(folder.path / "plan.png", plan.picture(path_world)))
     written += _write_pictures(fused, cloud, names)
     written += _write_excluded(fused, evidence, table)
+    for name in set(SOMETIMES) - {path.name for path in written}:  # of an older surface
+        remove(folder.path / name)
     counts = np.bincount(cloud.labels, minlength=len(names))
     shares = {names[k]: float(counts[k] / len(cloud)) for k in np.flatnonzero(counts).tolist()}
     return Products(written, len(cloud), shares)
@@ -198,8 +207,6 @@ def _write_clouds(fused: FusedMap, cloud: Cloud, names: tuple[str, ...]) -> list
     path, colours, pcd = fused.folder.path, palette(names), fused.options.pcd
     legend = dict(zip(names, colours.tolist(), strict=True))
     fused.folder.write_text("legend.json", json.dumps(legend, indent=1) + "\n")
-    for suffix in (".ply", ".pcd"):
-        remove((path / "semantic").with_suffix(suffix))
     written = []
     for name, palette_of in (("cloud", None), ("semantic", colours))[
         : 1 + bool(cloud.labels.any())
@@ -216,7 +223,6 @@ def _write_clouds(fused: FusedMap, cloud: Cloud, names: tuple[str, ...]) -> list
 def _write_excluded(fused: FusedMap, evidence: KeyframeEvidence, table: LabelTable) -> list[Path]:
     """Write the cloud of all keyframes' excluded points, if they were saved."""
     path = fused.folder.path / "moving"
-    path.with_suffix(".ply").unlink(missing_ok=True)
     saved = [(k, fused.folder.excluded(k.id)) for k in evidence.keyframes]
     if not any(submap for _, submap in saved):
         return []
@@ -234,7 +240,7 @@ def _write_excluded(fused: FusedMap, evidence: KeyframeEvidence, table: LabelTab
             sigmas_m = np.sqrt(submap.variances)
             one = np.ones(len(points), np.uint16)
             file.write(Cloud(points, normals, submap.colours, sigmas_m, *labels, one))
-    return [path.with_suffix(".ply")]
+    return [path.with_suffix(suffix) for suffix in (".ply", ".pcd")[: 1 + fused.options.pcd]]
 
 
 def _regions(fused: FusedMap) -> list[ObjectRegion]:
@@ -290,5 +296,4 @@ def _viewpoints(camera: Camera, keyframes: list[Keyframe]) -> dict[str, tuple[Ca
     T_middle_overview = make_pose(np.eye(3), OVERVIEW_OFFSET_M)
     T_middle_overview[1:3, 1:3] = [[np.cos(tilt), -np.sin(tilt)], [np.sin(tilt), np.cos(tilt)]]
     overview = middle @ T_middle_overview
-    views = (("first", first), ("middle", middle), ("overview", overview))
-    return {name: (camera, T) for name, T in views}
+    return {name: (camera, T) for name, T in zip(VIEWS, (first, middle, overview), strict=True)}

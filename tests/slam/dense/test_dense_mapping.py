@@ -172,6 +172,22 @@ def test_a_label_that_changes_in_the_store_changes_in_the_map(mapped: Path, tmp_
     assert [p.stat().st_mtime_ns for p in sorted((run / "dense" / "labels").iterdir())] == stamps
 
 
+def test_what_a_later_map_does_not_make_is_not_left_of_an_older_surface(
+    mapped: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(mapped, run)
+    (run / "dense" / "moving.pcd").write_text("of an older map")
+    (run / "dense" / "mesh.blend").write_text("the user's own")
+    (run / "dense" / "frames").mkdir()  # of a live run that was killed
+    (run / "dense" / "frames" / "00000001").write_bytes(bytes(9))
+    assert main(["map", str(run), "--voxel", "0.02", "--segmenter", "truth", "--quiet"]) == 0
+    names = {path.name for path in (run / "dense").iterdir()}
+    gone = {"mesh.ply", "mesh.glb", "view_mesh.png", "plan.png", "cloud.pcd", "semantic.pcd"}
+    assert not names & (gone | {"moving.pcd", "frames"})
+    assert names >= {"cloud.ply", "semantic.ply", "view_first_semantic.png", "mesh.blend"}
+
+
 def test_excluded_classes_are_missing_or_in_another_cloud(mapped: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(mapped, run)
