@@ -228,7 +228,11 @@ class GrowingSurface:
         return np.concatenate(found)
 
     def _points_camera(self, keyframe_id: int) -> Floats:
-        depth_m = unmasked_depth_m(self._folder, keyframe_id, self._excluded)
+        try:
+            depth_m = unmasked_depth_m(self._folder, keyframe_id, self._excluded)
+        except InputError as error:
+            logger.warning("%s; frames are judged without it", error)
+            return np.zeros((0, 3), np.float32)
         some = depth_m[::POINT_STEP_PX, ::POINT_STEP_PX]
         v, u = np.nonzero(np.isfinite(some))
         pixels = POINT_STEP_PX * np.stack([u, v], axis=-1).astype(float)
