@@ -46,13 +46,13 @@ NO_PIXELS = np.zeros((0, 0), np.uint16)
 OVERVIEW_OFFSET_M = np.array([0.0, -0.6, -1.0])
 OVERVIEW_TILT_DEG = -20.0
 """The overview is taken from behind and above a keyframe, tilted down."""
-
 VIEWS = ("first", "middle", "overview")
-SOMETIMES = (
-    *("semantic.ply", "semantic.pcd", "moving.ply", "moving.pcd", "mesh.ply", "mesh.glb"),
-    *("plan.png", "view_mesh.png", *(f"view_{name}_semantic.png" for name in VIEWS)),
+CLOUDS = ("semantic.ply", "semantic.pcd", "moving.ply", "moving.pcd")
+OF_SURFACE = (
+    *("mesh.ply", "mesh.glb", "view_mesh.png", "plan.png"),
+    *(f"view_{name}_semantic.png" for name in VIEWS),
 )
-"""Products that are not made of every map."""
+"""What is not made of every map; an old mesh or plan of the same surface may stay."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ def write_products(
     if not len(cloud):
         raise InputError(f"{fused.run.path}: no surface: all of it is of excluded classes")
     names, folder = table.stuff_fusion.names, fused.folder
-    written = _write_clouds(fused, cloud, names)
+    written, changed = _write_clouds(fused, cloud, names)
     if fused.options.mesh:
         written += _write_mesh(fused, cloud, surface.triangles, up_guess)
     if fused.options.plan:
@@ -118,7 +118,7 @@ def write_products(
         written.append(write_picture(folder.path / "plan.png", plan.picture(path_world)))
     written += _write_pictures(fused, cloud, names)
     written += _write_excluded(fused, evidence, table)
-    for name in set(SOMETIMES) - {path.name for path in written}:  # of an older surface
+    for name in {*CLOUDS, *OF_SURFACE * changed} - {path.name for path in written}:
         remove(folder.path / name)
     counts = np.bincount(cloud.labels, minlength=len(names))
     shares = {names[k]: float(counts[k] / len(cloud)) for k in np.flatnonzero(counts).tolist()}
@@ -202,22 +202,23 @@ def _pieces(count: int) -> Iterator[slice]:
     return (slice(k, min(k + AT_ONCE, count)) for k in range(0, count, AT_ONCE))
 
 
-def _write_clouds(fused: FusedMap, cloud: Cloud, names: tuple[str, ...]) -> list[Path]:
-    """Write the cloud, that in the colours of the labels if there are some, and the objects'."""
+def _write_clouds(fused: FusedMap, cloud: Cloud, names: tuple[str, ...]) -> tuple[list[Path], bool]:
+    """Write the cloud, that in the labels' colours, the objects'; whether it is another cloud."""
     path, colours, pcd = fused.folder.path, palette(names), fused.options.pcd
     legend = dict(zip(names, colours.tolist(), strict=True))
     fused.folder.write_text("legend.json", json.dumps(legend, indent=1) + "\n")
-    written = []
+    written, changed = [], False
     for name, palette_of in (("cloud", None), ("semantic", colours))[
         : 1 + bool(cloud.labels.any())
     ]:
         with CloudWriter(path / name, palette_of, pcd) as file:
             for some in _pieces(len(cloud)):
                 file.write(cloud.select(some))
+        changed |= file.changed
         written += [path / f"{name}{suffix}" for suffix in (".ply", ".pcd")[: 1 + pcd]]
     with ObjectClouds(path / "objects", _regions(fused), pcd) as objects:
         objects.write(cloud)
-    return written + objects.files
+    return written + objects.files, changed
 
 
 def _write_excluded(fused: FusedMap, evidence: KeyframeEvidence, table: LabelTable) -> list[Path]:

@@ -181,10 +181,15 @@ def test_what_a_later_map_does_not_make_is_not_left_of_an_older_surface(
     (run / "dense" / "mesh.blend").write_text("the user's own")
     (run / "dense" / "frames").mkdir()  # of a live run that was killed
     (run / "dense" / "frames" / "00000001").write_bytes(bytes(9))
-    assert main(["map", str(run), "--voxel", "0.02", "--segmenter", "truth", "--quiet"]) == 0
+    arguments = ["map", str(run), "--voxel", "0.02", "--segmenter", "truth", "--quiet"]
+    assert main(arguments) == 0
     names = {path.name for path in (run / "dense").iterdir()}
-    gone = {"mesh.ply", "mesh.glb", "view_mesh.png", "plan.png", "cloud.pcd", "semantic.pcd"}
-    assert not names & (gone | {"moving.pcd", "frames"})
+    assert not names & {"cloud.pcd", "semantic.pcd", "moving.pcd", "frames"}
+    of_surface = {"mesh.ply", "mesh.glb", "view_mesh.png", "plan.png"}
+    assert names >= of_surface | {"cloud.ply", "semantic.ply", "mesh.blend"}
+    assert main([*arguments, "--mesh-voxel", "0.05"]) == 0
+    names = {path.name for path in (run / "dense").iterdir()}
+    assert not names & of_surface
     assert names >= {"cloud.ply", "semantic.ply", "view_first_semantic.png", "mesh.blend"}
 
 
