@@ -48,6 +48,7 @@ ELSEWHERE = {
     "semantics/weights/checkpoints.py": "torch's and safetensors' own readers, after a bounded one",
     "semantics/weights/light_weights.py": "whether a file says that it is one",
     "slam/job_process.py": "its own argument",
+    "slam/dense/folder.py": "what it has just made",
     "slam/doctor/cameras.py": "/sys",
     "slam/doctor/machine.py": "/proc, /sys",
     "slam/doctor/packages.py": "what its own process prints",
