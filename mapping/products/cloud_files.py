@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Sequence
+from filecmp import cmp
 from pathlib import Path
 from typing import IO
 
@@ -28,6 +29,7 @@ class CloudWriter:
 
     Attributes:
         count: points written so far.
+        changed: whether the PLY file is another one than before; set at the end.
     """
 
     def __init__(self, stem: Path, palette: Bytes | None = None, pcd: bool = False) -> None:
@@ -35,7 +37,7 @@ class CloudWriter:
         their labels. Without ``pcd`` there is no such file, nor an old one of this name.
         """
         self.stem = stem
-        self.count = 0
+        self.count, self.changed = 0, False
         self._palette, self._pcd = palette, pcd
         self._body: IO[bytes] | None = None
 
@@ -64,6 +66,9 @@ class CloudWriter:
             out.write(header.encode("ascii"))
             body.seek(0)
             shutil.copyfileobj(body, out)
+            out.flush()
+            same = path.is_file() and cmp(temporary, path, shallow=False)
+            self.changed |= suffix == ".ply" and not same
 
 
 # PCD's rgb is a 32-bit number whose bytes are PLY's blue, green, red and alpha.

@@ -150,11 +150,13 @@ class FloorPlan:
         width, height = high - low + 1
         grid = np.full((height, width), -2, np.int16)
         grid[high[1] - self._floor[:, 1], self._floor[:, 0] - low[0]] = -1
-        votes = np.zeros((height, width, len(self._names)), np.int64)
         column, row, label, points = self._standing.T
-        np.add.at(votes, (high[1] - row, column - low[0], label), points)
-        occupied = votes.any(axis=2)
-        grid[occupied] = _labels(votes[occupied])
+        places, which = np.unique(
+            (high[1] - row) * width + column - low[0], return_inverse=True
+        )  # of the cells with obstacles: a table of all cells by all classes takes gigabytes
+        votes = np.zeros((len(places), len(self._names)), np.int64)
+        np.add.at(votes, (which, label), points)
+        grid.reshape(-1)[places] = _labels(votes)
         if WALL in self._names:
             self._close_walls(grid)
         return grid, np.column_stack([path[:, 0] - low[0], high[1] + 1 - path[:, 1]])

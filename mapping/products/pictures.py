@@ -88,8 +88,17 @@ def with_legend(image: Image, names: Sequence[str], labels: Sequence[int]) -> By
 
 
 def write_picture(path: Path, image: Image) -> Path:
-    """Save an image (H, W, 3), red first; returns its path. Raises InputError if it cannot."""
-    with whole_file(path) as temporary:
-        if not cv2.imwrite(str(temporary), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
-            raise InputError(f"{path}: cannot be written; free some space")
+    """Save an image (H, W, 3), red first; returns its path. Raises InputError if it cannot.
+
+    OpenCV would not say that the last bytes of a file found no space.
+    """
+    packed = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
+    try:
+        with whole_file(path) as temporary:
+            temporary.write_bytes(packed.tobytes())
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); free some space, or change its "
+            "permissions"
+        ) from error
     return path

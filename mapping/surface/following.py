@@ -52,6 +52,13 @@ class _Part:
         marks[blocks] = True
         return cls(T_world_camera, zlib.compress(np.packbits(marks).tobytes(), 1))
 
+    def also(self, blocks: Ints, total: int) -> _Part:
+        """The same frame, which changed these of ``total`` blocks too."""
+        marks = torch.zeros(total, dtype=torch.bool)
+        self.mark(marks)
+        marks[torch.from_numpy(blocks)] = True
+        return _Part.of(self.T_world_camera, np.flatnonzero(marks.numpy()))
+
     def mark(self, blocks: Tensor) -> None:
         """Mark the blocks (B,) in place."""
         bits = torch.from_numpy(self._bits(len(blocks)))
@@ -135,6 +142,7 @@ class FollowingSurface:
 
         Frames that were ``changed`` are taken as moved. Between the steps other frames may be
         added; until the last one ``stale`` blocks are not complete, and it must not begin anew.
+        Frames that cannot be read again are taken out of all their blocks in the end.
         """
         gone = [n for n in removed if n in self._parts]
         known = {n: T for n, T in poses.items() if n in self._parts and n not in gone}
@@ -144,20 +152,29 @@ class FollowingSurface:
         self._clear((*moved, *gone))
         for number in gone:
             del self._parts[number]
+        done, lost = 0, list[int]()
         for done, (number, part) in enumerate(list(self._parts.items())):
             if number not in moved and not part.on(self.stale):
                 yield done, False
                 continue
             frame = self._load(number, moved.get(number, part.T_world_camera))
-            if frame is None:
+            if frame is None and number in moved:
                 del self._parts[number]
+            elif frame is None:
+                lost.append(number)
             elif number in moved:
                 self.add(number, frame)
             else:
-                self.stale = _grown(self.stale, len(self.volume))  # by frames that moved
-                self.volume.integrate(frame, self.stale)
+                self._complete(number, frame)
             yield done, True
         self.stale = torch.zeros(0, dtype=torch.bool)
+        yield from ((done, was_read) for _, was_read in self.following({}, lost))
+
+    def _complete(self, number: int, frame: DepthFrame) -> None:
+        """Integrate a frame that has not moved into the stale blocks again."""
+        self.stale = _grown(self.stale, len(self.volume))  # by frames that moved
+        blocks = self.volume.integrate(frame, self.stale)
+        self._parts[number] = self._parts[number].also(blocks, len(self.volume))
 
     def _clear(self, numbers: Collection[int]) -> None:
         """Clear the blocks that some frames changed, which are stale from here on."""

@@ -38,6 +38,8 @@ logger = logging.getLogger(__name__)
 DriveFormat = Literal["nav2", "octomap"]
 MIN_FLOOR_POINTS = 200
 MIN_RESOLUTION_M, MAX_RESOLUTION_M = 0.01, 1.0
+MAX_CELLS = 1 << 27
+"""Of a grid: 580 m square at 5 cm. With a few points that are wrong by far it would be larger."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,10 @@ def export_drive_map(
         path = out.with_suffix(".bt")
         nodes = write_octomap(path, voxels)
         return (path,), f"{counts} voxels of {options.resolution_m:g} m in {nodes} nodes, z up"
+    spans = np.ptp(voxels.keys[:, :2], axis=0) + 1
+    if spans.prod() > MAX_CELLS:
+        size = " x ".join(f"{span * options.resolution_m:.0f}" for span in spans)
+        raise InputError(f"{run}: its map is {size} m large; choose a larger --resolution")
     grid = grid_of(voxels, options.low_m, options.high_m)
     height, width = grid.cells.shape
     shares = [100 * float((grid.cells == kind).mean()) for kind in (OCCUPIED, FREE)]

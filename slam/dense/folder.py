@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
@@ -40,7 +41,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, check_like, read_arrays, write_arrays
 from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.files.json_file import Name, check_json, read_json
-from bmask_slam.graph.files.reading import MAX_LINE
+from bmask_slam.graph.files.reading import MAX_LINE, read_bytes
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.mapping.inverse_depth.dense_mapper import FusedKeyframe
 from bmask_slam.mapping.inverse_depth.depth_map import (
@@ -52,6 +53,7 @@ from bmask_slam.mapping.products.pictures import write_picture
 from bmask_slam.mapping.products.submaps import Submap, read_submap, write_submap
 from bmask_slam.mapping.products.surface_labels import InstanceEvidence
 from bmask_slam.runtime.memory import give_back_memory
+from bmask_slam.semantics.instances.image_files import decode_bytes
 from bmask_slam.semantics.labels import LabelSet
 
 logger = logging.getLogger(__name__)
@@ -61,8 +63,8 @@ _NO_EVIDENCE = InstanceEvidence(
     np.zeros((0, 0), np.float32), np.zeros(0, np.int64), np.zeros(0, np.uint16)
 )
 NewIds = Callable[[Ints], Ints]
-PARTS = ("depth", "colours", "moving", "labels")
-OLD_PARTS = ("submaps", "volume", "frames")
+PARTS, FRAMES = ("depth", "colours", "moving", "labels"), "frames"
+OLD_PARTS = ("submaps", "volume", FRAMES)
 METHOD = 4
 """Version of the method; to be raised when the same settings give other submaps than before."""
 
@@ -170,8 +172,9 @@ class DenseFolder:
             evidence = replace(evidence, landmark_ids=new_landmarks(evidence.landmark_ids))
             if (excluded := other.excluded(old)) is not None:
                 self.write_excluded(replace(excluded, anchor=new))
-            shutil.copyfile(other._image(old), self._image(new))
-            shutil.copyfile(other._file("depth", old), self._file("depth", new))
+            other.colours(old), other.fused(old)  # a link may lead to a file that is neither
+            _copy(other._image(old), self._image(new))
+            _copy(other._file("depth", old), self._file("depth", new))
             _write_evidence(self._file("labels", new), evidence)
         return len(done)
 
@@ -193,7 +196,8 @@ class DenseFolder:
 
     def finished(self) -> list[int]:
         """Ids of the finished keyframes."""
-        ids = (int(path.name) for path in (self.path / "labels").glob("[0-9]*[0-9]"))
+        names = (path.name for path in (self.path / "labels").glob("[0-9]*"))
+        ids = (int(name) for name in names if re.fullmatch("[0-9]{6,18}", name))
         return sorted(number for number in ids if self.is_done(number))
 
     def write(self, result: FusedKeyframe, evidence: InstanceEvidence) -> None:
@@ -234,10 +238,8 @@ class DenseFolder:
     def colours(self, keyframe_id: int) -> Image:
         """Colours (H, W, 3) of a finished keyframe. Raises InputError if they cannot be read."""
         path = self._image(keyframe_id)
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
-        if image is None:
-            raise InputError(f"{path}: is missing or no image; remove {self.path} and map again")
-        return np.asarray(image, np.uint8)
+        data = read_bytes(path, f"remove {self.path} and map again")
+        return np.asarray(decode_bytes(data, cv2.IMREAD_COLOR_RGB, str(path)), np.uint8)
 
     def evidence(self, keyframe_id: int) -> InstanceEvidence:
         """The evidence of a finished keyframe about the classes of its instances."""
@@ -248,8 +250,9 @@ class DenseFolder:
         kinds = _arrays(_NO_EVIDENCE)
         arrays = {n: a.astype(kinds[n].dtype) if n in kinds else a for n, a in arrays.items()}
         check_like(arrays, kinds, path)
-        if len(arrays["landmark_ids"]) != len(arrays["landmark_instances"]):
-            raise InputError(f"{path}: its arrays have different lengths; remove it and map again")
+        alike = len(arrays["landmark_ids"]) == len(arrays["landmark_instances"])
+        if not alike or not arrays["log_likelihoods"].shape[1]:
+            raise InputError(f"{path}: its arrays do not fit together; remove it and map again")
         names = check_json(header.get("stuff", []), list[Name], f"{path}: its classes", "map again")
         if arrays["stuff"].shape[1] != len(names) or (len(arrays["stuff"]) and not names):
             raise InputError(
@@ -278,6 +281,15 @@ class DenseFolder:
 
     def _file(self, kind: str, keyframe_id: int) -> Path:
         return self.path / kind / f"{keyframe_id:06d}"
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy a file whole. Raises InputError if it cannot be read or written."""
+    try:
+        with whole_file(target) as temporary:
+            temporary.write_bytes(read_bytes(source, "map its run again"))
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written ({error.strerror}); free space") from error
 
 
 def _write_evidence(path: Path, evidence: InstanceEvidence) -> None:

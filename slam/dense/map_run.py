@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.datasets.weights import find_weights
-from bmask_slam.dense.folder import DenseFolder, folder_settings
+from bmask_slam.dense.folder import FRAMES, DenseFolder, folder_settings
 from bmask_slam.dense.keyframe_fusion import FusionCounts, KeyframeFusion
 from bmask_slam.dense.keyframe_input import image_name, load_keyframe
 from bmask_slam.dense.options import MapOptions, resolve_options
@@ -22,6 +22,7 @@ from bmask_slam.dense.saved_map import MappedRun, open_run, with_right_images
 from bmask_slam.dense.surface import FusedMap
 from bmask_slam.graph.arrays import Image, Mask
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.whole_file import remove
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.mapping.inverse_depth.dense_mapper import WINDOW
 from bmask_slam.run_folder.map_file import run_semantics
@@ -68,6 +69,7 @@ def map_run(options: MapOptions, progress: Progress = lambda done, total: None) 
     products = write_products(fused, progress)
     summary = MapSummary(fused.folder.path, counts, products, time.perf_counter() - started_s)
     write_summary(fused.folder, summary)
+    remove(fused.folder.path / FRAMES)  # of a live run that was killed
     return summary
 
 

@@ -14,6 +14,7 @@ from bmask_slam.dense.surface import FusedMap, frames_a_keyframe, make_surface
 from bmask_slam.graph.arrays import Array, Floats, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import fitting
 from bmask_slam.graph.files.file_names import file_stem
 from bmask_slam.graph.geometry import make_pose
 from bmask_slam.graph.whole_file import remove
@@ -45,6 +46,13 @@ NO_PIXELS = np.zeros((0, 0), np.uint16)
 OVERVIEW_OFFSET_M = np.array([0.0, -0.6, -1.0])
 OVERVIEW_TILT_DEG = -20.0
 """The overview is taken from behind and above a keyframe, tilted down."""
+VIEWS = ("first", "middle", "overview")
+CLOUDS = ("semantic.ply", "semantic.pcd", "moving.ply", "moving.pcd")
+OF_SURFACE = (
+    *("mesh.ply", "mesh.glb", "view_mesh.png", "plan.png"),
+    *(f"view_{name}_semantic.png" for name in VIEWS),
+)
+"""What is not made of every map; an old mesh or plan of the same surface may stay."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +107,7 @@ def write_products(
     if not len(cloud):
         raise InputError(f"{fused.run.path}: no surface: all of it is of excluded classes")
     names, folder = table.stuff_fusion.names, fused.folder
-    written = _write_clouds(fused, cloud, names)
+    written, changed = _write_clouds(fused, cloud, names)
     if fused.options.mesh:
         written += _write_mesh(fused, cloud, surface.triangles, up_guess)
     if fused.options.plan:
@@ -110,6 +118,8 @@ def write_products(
         written.append(write_picture(folder.path / "plan.png", plan.picture(path_world)))
     written += _write_pictures(fused, cloud, names)
     written += _write_excluded(fused, evidence, table)
+    for name in {*CLOUDS, *OF_SURFACE * changed} - {path.name for path in written}:
+        remove(folder.path / name)
     counts = np.bincount(cloud.labels, minlength=len(names))
     shares = {names[k]: float(counts[k] / len(cloud)) for k in np.flatnonzero(counts).tolist()}
     return Products(written, len(cloud), shares)
@@ -160,9 +170,10 @@ class KeyframeEvidence:
         fused = self._fused
         store_config = run_semantics(fused.run.path).labels
         prior, rows = store_config.prior(len(fused.labels)), []
-        for one in self._all:
-            distributions, known = fused.run.label_distributions(one.landmark_ids, fused.labels)
-            rows.append(one.with_landmarks(distributions, known, prior))
+        for one, keyframe in zip(self._all, self.keyframes, strict=True):
+            with fitting(fused.folder.path / "labels" / f"{keyframe.id:06d}"):
+                distributions, known = fused.run.label_distributions(one.landmark_ids, fused.labels)
+                rows.append(one.with_landmarks(distributions, known, prior))
         names: tuple[str, ...] = next(filter(None, (e.stuff_names for e in self._all)), ())
         stuff = StuffFusion.of(fused.labels.names, names, ground)
         return LabelTable.of(rows, store_config, [e.stuff_of(names) for e in self._all], stuff)
@@ -191,30 +202,28 @@ def _pieces(count: int) -> Iterator[slice]:
     return (slice(k, min(k + AT_ONCE, count)) for k in range(0, count, AT_ONCE))
 
 
-def _write_clouds(fused: FusedMap, cloud: Cloud, names: tuple[str, ...]) -> list[Path]:
-    """Write the cloud, that in the colours of the labels if there are some, and the objects'."""
+def _write_clouds(fused: FusedMap, cloud: Cloud, names: tuple[str, ...]) -> tuple[list[Path], bool]:
+    """Write the cloud, that in the labels' colours, the objects'; whether it is another cloud."""
     path, colours, pcd = fused.folder.path, palette(names), fused.options.pcd
     legend = dict(zip(names, colours.tolist(), strict=True))
     fused.folder.write_text("legend.json", json.dumps(legend, indent=1) + "\n")
-    for suffix in (".ply", ".pcd"):
-        remove((path / "semantic").with_suffix(suffix))
-    written = []
+    written, changed = [], False
     for name, palette_of in (("cloud", None), ("semantic", colours))[
         : 1 + bool(cloud.labels.any())
     ]:
         with CloudWriter(path / name, palette_of, pcd) as file:
             for some in _pieces(len(cloud)):
                 file.write(cloud.select(some))
+        changed |= file.changed
         written += [path / f"{name}{suffix}" for suffix in (".ply", ".pcd")[: 1 + pcd]]
     with ObjectClouds(path / "objects", _regions(fused), pcd) as objects:
         objects.write(cloud)
-    return written + objects.files
+    return written + objects.files, changed
 
 
 def _write_excluded(fused: FusedMap, evidence: KeyframeEvidence, table: LabelTable) -> list[Path]:
     """Write the cloud of all keyframes' excluded points, if they were saved."""
     path = fused.folder.path / "moving"
-    path.with_suffix(".ply").unlink(missing_ok=True)
     saved = [(k, fused.folder.excluded(k.id)) for k in evidence.keyframes]
     if not any(submap for _, submap in saved):
         return []
@@ -224,14 +233,15 @@ def _write_excluded(fused: FusedMap, evidence: KeyframeEvidence, table: LabelTab
                 continue
             points, normals = submap.placed(keyframe.T_world_camera)
             rows = np.arange(len(points)), submap.instances.astype(np.int64) + first
-            on = csr_matrix(
-                (np.ones(len(points), np.float32), rows), (len(points), len(table.submaps))
-            )
+            with fitting(path / f"{keyframe.id:06d}"):
+                on = csr_matrix(
+                    (np.ones(len(points), np.float32), rows), (len(points), len(table.submaps))
+                )
             labels = table.labels(on, points, normals)
             sigmas_m = np.sqrt(submap.variances)
             one = np.ones(len(points), np.uint16)
             file.write(Cloud(points, normals, submap.colours, sigmas_m, *labels, one))
-    return [path.with_suffix(".ply")]
+    return [path.with_suffix(suffix) for suffix in (".ply", ".pcd")[: 1 + fused.options.pcd]]
 
 
 def _regions(fused: FusedMap) -> list[ObjectRegion]:
@@ -287,5 +297,4 @@ def _viewpoints(camera: Camera, keyframes: list[Keyframe]) -> dict[str, tuple[Ca
     T_middle_overview = make_pose(np.eye(3), OVERVIEW_OFFSET_M)
     T_middle_overview[1:3, 1:3] = [[np.cos(tilt), -np.sin(tilt)], [np.sin(tilt), np.cos(tilt)]]
     overview = middle @ T_middle_overview
-    views = (("first", first), ("middle", middle), ("overview", overview))
-    return {name: (camera, T) for name, T in views}
+    return {name: (camera, T) for name, T in zip(VIEWS, (first, middle, overview), strict=True)}

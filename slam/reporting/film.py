@@ -277,7 +277,12 @@ def _write_video(path: Path, pictures: Sequence[Image], options: FilmOptions) ->
     writer = cv2.VideoWriter(str(path), code, options.fps_hz, (width, height))
     if not writer.isOpened():
         raise InputError(f"{path}: OpenCV has no encoder for it here; use .gif or .webp")
-    last = [pictures[-1]] * round(LAST_S * options.fps_hz)
-    for picture in (*pictures, *last):
+    shown = [*pictures, *[pictures[-1]] * round(LAST_S * options.fps_hz)]
+    for picture in shown:
         writer.write(np.ascontiguousarray(picture[..., ::-1]))
     writer.release()
+    written = cv2.VideoCapture(str(path))  # the writer says nothing of a full disk
+    is_whole = round(written.get(cv2.CAP_PROP_FRAME_COUNT)) == len(shown)
+    written.release()
+    if not is_whole:
+        raise InputError(f"{options.path}: cannot be written whole; free some space")

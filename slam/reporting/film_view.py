@@ -18,7 +18,7 @@ ELEVATION_DEG, SWING_DEG = 48.0, 14.0
 FILLED, FIT_QUANTILE = 0.94, 0.99
 FOCAL_SHARE = 1.2
 HEAD_ROOM_M = 0.4
-"""What is so much higher than the highest camera, as a ceiling, is left out."""
+"""What is so much higher than the highest camera, as a ceiling, is left out, unless all is."""
 FRUSTUM_M, MIN_DISTANCE_M = 0.25, 0.5
 SIZES_PX = (2, 4)
 BACKGROUND = (250, 250, 248)
@@ -64,7 +64,7 @@ def make_view(
     cameras = poses_world_camera[:, :3, 3]
     highest_m = (cameras @ up_world).max() + HEAD_ROOM_M
     kept = cloud.points_world @ up_world < highest_m
-    cloud = cloud.select(kept)
+    cloud = cloud.select(kept if kept.any() else ~kept)
     towards = cameras[cloud.first] - cloud.points_world
     towards /= np.linalg.norm(towards, axis=1, keepdims=True) + 1e-9
     width, height = size_px

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import cv2
 
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import read_bytes
 from bmask_slam.reporting.parts import Picture
 from bmask_slam.semantics.instances.image_files import decode_image
 
-FILM_SUFFIX = ".gif"
+FILM_SUFFIX, GIF = ".gif", (b"GIF87a", b"GIF89a")
 
 
 def read_picture(path: Path, title: str, width_px: int) -> Picture:
@@ -21,6 +22,8 @@ def read_picture(path: Path, title: str, width_px: int) -> Picture:
     """
     if path.suffix == FILM_SUFFIX:
         data = read_bytes(path, "make it again by bmask-slam film")
+        if not data.startswith(GIF):  # it goes into the page as it is
+            raise InputError(f"{path}: is no GIF; make it again by bmask-slam film")
         width, height = (int.from_bytes(data[k : k + 2], "little") for k in (6, 8))
         return Picture(title, f"{title}.", data, "image/gif", (width, height), wide=True)
     image = decode_image(path, cv2.IMREAD_COLOR)

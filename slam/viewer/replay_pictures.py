@@ -74,4 +74,9 @@ class ReplayPictures:
         jpeg = as_jpeg(frame.rgb)
         scene.log_image(jpeg)
         if self._segmenter is not None and line in self._masked:
-            scene.log_masks(jpeg, self._segmenter.segment(frame.rgb, frame.name), self.names)
+            try:
+                instances = self._segmenter.segment(frame.rgb, frame.name)
+            except InputError as error:
+                logger.warning("shown without masks: %s", error)
+                return
+            scene.log_masks(jpeg, instances, self.names)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.dense.folder import FRAMES
 from bmask_slam.dense.growing.frames import SurfaceFrame
 from bmask_slam.graph.arrays import Array, Arrays, Bytes, Floats
 from bmask_slam.graph.camera import Camera
@@ -24,7 +25,6 @@ from bmask_slam.sequences.frame import Frame
 
 logger = logging.getLogger(__name__)
 
-FRAMES = "frames"
 FRAME_FILE = FileKind("surface frame", 1)
 UNITS_A_M = 5000
 """Depth is stored in whole 0.2 mm up to 13.1 m: exact where a sensor's unit is 0.2 or 1 mm."""

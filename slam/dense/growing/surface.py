@@ -16,12 +16,13 @@ import numpy as np
 
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.growing.store import FrameStore
-from bmask_slam.dense.options import MapOptions, fusion_config
+from bmask_slam.dense.options import MapOptions
 from bmask_slam.dense.surface import gated_frame, keyframe_as_frame, unmasked_depth_m
 from bmask_slam.graph.arrays import Array, Floats
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import transform
+from bmask_slam.mapping.inverse_depth.depth_map import MeasurementConfig
 from bmask_slam.mapping.surface.depth_frame import DepthFrame
 from bmask_slam.mapping.surface.extraction import (
     MIN_WITNESSES,
@@ -68,6 +69,7 @@ class GrowingSurface:
         frames: FrameStore,
         camera: Camera,
         options: MapOptions,
+        measurement: MeasurementConfig,
         excluded: list[int],
     ) -> None:
         """``options`` are resolved; ``excluded`` are the numbers of the classes left out.
@@ -78,7 +80,7 @@ class GrowingSurface:
         self.fused = set(folder.finished())
         self.frames = frames
         self._folder, self._camera, self._options = folder, camera, options
-        self._excluded, self._measurement = excluded, fusion_config(options).measurement
+        self._excluded, self._measurement = excluded, measurement
         self._poses: dict[int, Array] = {}
         self._judges: dict[int, list[int]] = {}
         self._points: OrderedDict[int, Floats] = OrderedDict()
@@ -226,7 +228,11 @@ class GrowingSurface:
         return np.concatenate(found)
 
     def _points_camera(self, keyframe_id: int) -> Floats:
-        depth_m = unmasked_depth_m(self._folder, keyframe_id, self._excluded)
+        try:
+            depth_m = unmasked_depth_m(self._folder, keyframe_id, self._excluded)
+        except InputError as error:
+            logger.warning("%s; frames are judged without it", error)
+            return np.zeros((0, 3), np.float32)
         some = depth_m[::POINT_STEP_PX, ::POINT_STEP_PX]
         v, u = np.nonzero(np.isfinite(some))
         pixels = POINT_STEP_PX * np.stack([u, v], axis=-1).astype(float)

@@ -13,7 +13,7 @@ from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.growing.frames import FrameOptions, FramesTaken, SurfaceFrame
 from bmask_slam.dense.growing.store import FrameStore
 from bmask_slam.dense.growing.surface import PARTS_AT_ONCE, GrowingSurface
-from bmask_slam.dense.options import MapOptions
+from bmask_slam.dense.options import MapOptions, fusion_config
 from bmask_slam.dense.products import GrownSurface
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
@@ -50,6 +50,7 @@ class SurfaceWorker:
         self.grows, self.is_shown = True, False
         self._folder, self._camera, self._options, self._send = folder, camera, options, send
         self._frames = FrameStore(folder.path, camera, frames.max_bytes)
+        self._measurement = fusion_config(options).measurement  # the run folder may move
         self._poses: dict[int, Array] = {}
         self._surface: GrowingSurface | None = None
         self._begin_s = self._show_s = 0.0
@@ -136,7 +137,7 @@ class SurfaceWorker:
     def _begun(self) -> GrowingSurface:
         """The surface, begun if there is none. Raises InputError: the disk is full."""
         if self._surface is None:
-            made_of = self._folder, self._frames, self._camera, self._options
+            made_of = self._folder, self._frames, self._camera, self._options, self._measurement
             self._surface = GrowingSurface(*made_of, self.excluded)
             self._surface.place(self._poses)
         return self._surface

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from bmask_slam.dense.growing.frames import FrameQueue, FramesTaken, ShownParts, SurfaceFrame
+from bmask_slam.dense.growing.frames import FrameQueue, FramesTaken, ShownParts
 from bmask_slam.dense.keyframe_input import KeyframeSnapshot
 from bmask_slam.graph.arrays import Bytes, Floats
 from bmask_slam.live.messages import Masks
@@ -90,7 +90,6 @@ class RemoteDenseMapper:
         self.skipped: dict[int, str] = {}
         self.keeps_previews = True
         self.shown = ShownParts()
-        self.frames = FrameQueue(setup.frames, self._send_frame)
         self._poses = NO_POSES
         self.dropped = self.unwritten = 0
         self._waiting: dict[int, _Waiting] = {}
@@ -103,6 +102,7 @@ class RemoteDenseMapper:
         target = "bmask_slam.live.processes.dense_process:serve_dense"
         self._setup = setup
         self.worker = SupervisedWorker("dense mapper", target, (setup,), policy or RestartPolicy())
+        self.frames = FrameQueue(setup.frames, self.worker.send)
 
     @property
     def waiting(self) -> int:
@@ -260,9 +260,6 @@ class RemoteDenseMapper:
             for listener in self.listeners:
                 listener(message.keyframe_id, message.preview.points, message.preview.colours)
 
-    def _send_frame(self, frame: SurfaceFrame) -> None:
-        self.worker.send(frame)
-
     def _send_new(self, number: int, world: WorldMap) -> None:
         """Send a keyframe with its present pose and landmarks."""
         waiting, keyframe = self._waiting.pop(number), world.keyframes.get(number)
@@ -292,7 +289,8 @@ class RemoteDenseMapper:
             self.worker.send(ShowSurface())
         self.frames.send_again()
         if self.worker.crashes >= LAST_CRASH:
-            self.worker.arguments = (replace(self._setup, grows=False),)
+            self._setup = replace(self._setup, grows=False)
+            self.worker.arguments = (self._setup,)
 
     def _skip(self, number: int, reason: str) -> None:
         self._waiting.pop(number, None)

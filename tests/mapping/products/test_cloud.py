@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.sparse import csr_matrix
 
 from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.mapping.open3d_loader import load_open3d
 from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.cloud_files import CloudWriter
-from bmask_slam.mapping.products.pictures import palette
+from bmask_slam.mapping.products.pictures import palette, write_picture
 from bmask_slam.mapping.products.surface_labels import LabelTable, keyframe_labels
 from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
 from bmask_slam.semantics.beliefs.label_store import LabelStore
@@ -142,3 +145,18 @@ def test_a_better_mask_has_more_weight() -> None:
     assert evidence[1, 1] > evidence[2, 1] > 0 > evidence[2, 2] > evidence[1, 2]
     assert not evidence[0].any()
     assert np.isfinite(evidence).all()
+
+
+def test_a_picture_whose_last_bytes_find_no_space_is_not_written(tmp_path: Path) -> None:
+    image = RNG.integers(0, 256, (60, 80, 3)).astype(np.uint8)
+    size = write_picture(tmp_path / "whole.png", image).stat().st_size
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size - 50, before[1]))
+    try:
+        with pytest.raises(InputError, match=r"cut\.png: cannot be written"):
+            write_picture(tmp_path / "cut.png", image)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [path.name for path in tmp_path.iterdir()] == ["whole.png"]
+    with pytest.raises(InputError, match="No such file or directory"):
+        write_picture(tmp_path / "nowhere" / "a.png", image)

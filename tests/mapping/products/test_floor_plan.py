@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -149,3 +151,25 @@ def test_walls_are_those_of_the_labels_and_their_gaps_are_closed() -> None:
     row = np.flatnonzero((grid == 2).any(axis=1))
     assert len(row) == 1
     assert (grid[row[0]] == 2)[: round(2.95 / 0.05)].all()
+
+
+def test_a_plan_takes_memory_for_what_stands_there_not_for_all_cells_and_classes() -> None:
+    """Two walls, 20 m apart, and ninety classes."""
+    points = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (1000, 1))
+    points[:, 0] = np.linspace(0, 20, 1000)
+    points[500:, 1] = 20.0
+    one = np.ones(1000, np.float32)
+    labels = (np.arange(1000) % 90).astype(np.uint16)
+    colours, views = np.zeros((1000, 3), np.uint8), one.astype(np.uint16)
+    walls = Cloud(points, points, colours, one, labels, one, views)
+    plan = FloorPlan(PlanFrame(np.eye(3), 0.0, 0.03), [f"class {k}" for k in range(90)])
+    plan.add(walls)
+    tracemalloc.start()
+    try:
+        grid, _ = plan.grid(np.zeros((1, 3)))
+        peak_bytes = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert grid.shape == (667, 667)
+    assert len(np.unique(grid)) > 80
+    assert peak_bytes < 20 * grid.nbytes

@@ -162,6 +162,40 @@ def test_a_moved_frame_may_make_blocks_in_view_of_others() -> None:
     assert np.mean(np.abs(left - WALL_M) < 0.01) > 0.4
 
 
+def test_blocks_that_came_after_a_frame_are_cleared_of_it_too() -> None:
+    """Frame 0 makes blocks before frame 1's wall and leaves them to it; then that is removed."""
+    surface = FollowingSurface(SurfaceVolume(VOXEL_M, CAMERA), seen_from)
+    for number in (0, 1):
+        surface.add(number, seen_from(number, TRUE[number]))
+    nearer, elsewhere = TRUE[0].copy(), BACK @ TRUE[0]
+    nearer[2, 3] -= 1.0
+    elsewhere[0, 3] += 50.0
+    surface.follow({0: nearer, 1: TRUE[1]})
+    surface.follow({0: elsewhere, 1: TRUE[1]})
+    surface.follow({}, removed=[1])
+    surface.follow({}, removed=[0])
+    for table in (surface.volume.weight, surface.volume.free, surface.volume.witnesses):
+        assert not table.any()
+
+
+def test_a_frame_that_cannot_be_read_again_leaves_no_trace() -> None:
+    missing: set[int] = set()
+
+    def load(number: int, T: Array) -> DepthFrame | None:
+        return None if number in missing else seen_from(number, T)
+
+    surface = FollowingSurface(SurfaceVolume(VOXEL_M, CAMERA), load)
+    for number in TRUE:
+        surface.add(number, seen_from(number, drifted(number)))
+    missing.add(8)  # it has blocks of its own, too
+    surface.follow({9: TRUE[9]})
+    assert 8 not in surface
+    believed = {n: drifted(n) for n in range(8)} | {9: TRUE[9]}
+    expected, found = scratch(believed), extract(surface.volume)
+    np.testing.assert_array_equal(found.views, expected.views)
+    np.testing.assert_allclose(found.vertices, expected.vertices, atol=1e-4)
+
+
 def test_a_frame_without_depth_changes_nothing() -> None:
     surface = FollowingSurface(SurfaceVolume(VOXEL_M, CAMERA), seen_from)
     nothing, rgb = as_map(np.full((30, 40), np.nan), 0.002), np.zeros((30, 40, 3), np.uint8)

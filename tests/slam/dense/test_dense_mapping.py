@@ -21,15 +21,17 @@ from bmask_slam.dense.folder import LABEL_FILE, DenseFolder
 from bmask_slam.dense.keyframe_input import load_keyframe
 from bmask_slam.dense.map_run import map_run
 from bmask_slam.dense.options import MapOptions
+from bmask_slam.dense.products import KeyframeEvidence
 from bmask_slam.dense.saved_map import MappedRun, open_run
 from bmask_slam.dense.surface import FusedMap, make_surface
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.array_file import nested, write_arrays
-from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.files.array_file import nested, read_arrays, write_arrays
+from bmask_slam.graph.files.ply import read_ply, write_ply
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.mapping.products.cloud import Cloud
+from bmask_slam.mapping.products.submaps import read_submap, write_submap
 from bmask_slam.rendering.sequence import RenderConfig
 from bmask_slam.run_folder.map_file import read_map, write_map
 from bmask_slam.semantics.beliefs.label_store import LabelStore
@@ -169,6 +171,27 @@ def test_a_label_that_changes_in_the_store_changes_in_the_map(mapped: Path, tmp_
     assert shares[1].get(names.names[old], 0) < 0.3 * shares[0][names.names[old]]
     assert shares[1]["cup"] > shares[0].get("cup", 0) + 0.5 * shares[0][names.names[old]]
     assert [p.stat().st_mtime_ns for p in sorted((run / "dense" / "labels").iterdir())] == stamps
+
+
+def test_what_a_later_map_does_not_make_is_not_left_of_an_older_surface(
+    mapped: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(mapped, run)
+    (run / "dense" / "moving.pcd").write_text("of an older map")
+    (run / "dense" / "mesh.blend").write_text("the user's own")
+    (run / "dense" / "frames").mkdir()  # of a live run that was killed
+    (run / "dense" / "frames" / "00000001").write_bytes(bytes(9))
+    arguments = ["map", str(run), "--voxel", "0.02", "--segmenter", "truth", "--quiet"]
+    assert main(arguments) == 0
+    names = {path.name for path in (run / "dense").iterdir()}
+    assert not names & {"cloud.pcd", "semantic.pcd", "moving.pcd", "frames"}
+    of_surface = {"mesh.ply", "mesh.glb", "view_mesh.png", "plan.png"}
+    assert names >= of_surface | {"cloud.ply", "semantic.ply", "mesh.blend"}
+    assert main([*arguments, "--mesh-voxel", "0.05"]) == 0
+    names = {path.name for path in (run / "dense").iterdir()}
+    assert not names & of_surface
+    assert names >= {"cloud.ply", "semantic.ply", "view_first_semantic.png", "mesh.blend"}
 
 
 def test_excluded_classes_are_missing_or_in_another_cloud(mapped: Path, tmp_path: Path) -> None:
@@ -440,3 +463,91 @@ def test_keyframes_of_another_dense_map_are_taken_over(mapped: Path, tmp_path: P
     assert (after.log_likelihoods == before.log_likelihoods).all()
     np.testing.assert_array_equal(folder.fused(21).rho, part.fused(1).rho)  # NaN where missing
     assert (folder.colours(20) == part.colours(0)).all()
+
+
+@pytest.mark.parametrize("kind", ["colours/000001.jpg", "depth/000001"])
+def test_a_link_to_another_file_in_a_dense_map_is_not_copied(
+    mapped: Path, tmp_path: Path, kind: str
+) -> None:
+    """As in a run that a stranger sent, to be merged: what it leads to would be in the result."""
+    shutil.copytree(mapped / "dense", tmp_path / "given" / "dense")
+    (tmp_path / "private").write_text("secret")
+    (tmp_path / "given" / "dense" / kind).unlink()
+    (tmp_path / "given" / "dense" / kind).symlink_to(tmp_path / "private")
+    (tmp_path / "merged").mkdir()
+    part = DenseFolder.reading(tmp_path / "given")
+    folder = DenseFolder(tmp_path / "merged", part.settings | {"run": "another"})
+    with pytest.raises(InputError, match=f"{kind}: not a"):
+        folder.take_over(part, {1: 21}, lambda ids: ids)
+    held = [path.read_bytes() for path in folder.path.rglob("*") if path.is_file()]
+    assert not [data for data in held if b"secret" in data]
+
+
+def test_files_with_other_names_among_the_keyframes_are_no_keyframes(mapped: Path) -> None:
+    folder = DenseFolder.reading(mapped)
+    before = folder.finished()
+    for name in ("000003 copy 2", "1_000", "000003-1"):
+        (mapped / "dense" / "labels" / name).write_text("")
+    assert folder.finished() == before
+    for name in ("000003 copy 2", "1_000", "000003-1"):
+        (mapped / "dense" / "labels" / name).unlink()
+
+
+@pytest.mark.parametrize("wrong", ["classes", "instance", "landmark", "no classes"])
+def test_evidence_of_other_classes_landmarks_or_instances_is_refused(
+    mapped: Path, tmp_path: Path, wrong: str
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(mapped, run)
+    names = CocoSegmenter(truth_file(open_run(run))).labels
+    store, ids = LabelStore(len(names)), np.flatnonzero(open_run(run).world.landmarks.in_map)
+    table = np.full((len(ids), len(names)), 1 / len(names), np.float32)
+    store.update(ids, table, np.full(len(ids), 0.9, np.float32))
+    state, camera = read_map(run)
+    known = {"names": np.array(names.names), **nested(labels=store.state())}
+    write_map(run / "map", state | nested(semantics=known), camera)
+    fused = FusedMap(open_run(run), names, DenseFolder.open(run), MapOptions(run))
+    KeyframeEvidence(fused).table(None)
+    path = run / "dense" / "labels" / "000001"
+    header, arrays = read_arrays(path, LABEL_FILE)
+    one = arrays["log_likelihoods"]
+    change = {
+        "classes": {"log_likelihoods": one[:, :-1]},
+        "instance": {"landmark_instances": np.full_like(arrays["landmark_instances"], 60000)},
+        "landmark": {"landmark_ids": np.full_like(arrays["landmark_ids"], 10**9)},
+        "no classes": {"log_likelihoods": one[:, :0]},
+    }
+    write_arrays(path, LABEL_FILE, {"stuff": header["stuff"]}, arrays | change[wrong])
+    with pytest.raises(InputError, match="labels/000001: its arrays do not fit together"):
+        KeyframeEvidence(fused).table(None)
+
+
+def test_excluded_points_of_an_instance_that_is_not_there_are_refused(
+    mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(mapped, run)
+    arguments = ["map", str(run), "--voxel", "0.05", "--segmenter", "truth", "--without", "chair"]
+    arguments += ["--moving", "--quiet"]
+    assert main(arguments) == 0
+    path = next(p for p in sorted((run / "dense" / "moving").iterdir()) if len(read_submap(p)))
+    submap = read_submap(path)
+    write_submap(path, replace(submap, instances=np.full_like(submap.instances, 60000)))
+    assert main(arguments) == 1
+    assert f"moving/{path.name}: its arrays do not fit together" in capsys.readouterr().err
+
+
+def test_a_map_to_drive_on_that_is_too_large_by_a_few_points_is_refused(
+    mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(mapped, run)
+    arguments = ["export", str(run), "--format", "nav2", "--out", str(tmp_path / "map.yaml")]
+    assert main(arguments) == 0
+    cloud = read_ply(run / "dense" / "cloud.ply")
+    for rows, place in ((slice(-3, None), (1000.0, 0, 0)), (slice(-6, -3), (0, 0, 1000.0))):
+        for axis, value in zip("xyz", place, strict=True):
+            cloud[axis][rows] = value
+    write_ply(run / "dense" / "cloud.ply", cloud)
+    assert main(arguments) == 1
+    assert "m large; choose a larger --resolution" in capsys.readouterr().err

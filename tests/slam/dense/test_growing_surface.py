@@ -31,6 +31,7 @@ from bmask_slam.live.processes.dense_messages import (
     LateMasks,
     MapPoses,
     RemoveKeyframes,
+    RunMoved,
     ShowSurface,
 )
 from bmask_slam.live.processes.dense_process import DenseServer
@@ -188,6 +189,31 @@ def test_parts_that_change_are_shown_and_those_that_vanish_emptied(grown) -> Non
     assert not any(len(p.triangles) for p in parts.values())
 
 
+def test_a_keyframe_culled_while_a_loop_is_followed_leaves_no_trace(tmp_path) -> None:
+    server = with_keyframes(make_server(tmp_path / "run"))
+    worked(server)
+    drifted = {k: T.copy() for k, T in POSES.items()}
+    drifted[0][2, 3] += 0.1
+    placed(server, drifted)
+    surface = server.growing._begun()
+    while surface._following is None:
+        server.growing.work()
+    server.handle(RemoveKeyframes([3]))
+    found = worked(server)
+    again = make_server(tmp_path / "run")
+    placed(again, drifted)
+    np.testing.assert_array_equal(np.sort(found.views), np.sort(worked(again).views))
+
+
+def test_a_broken_keyframe_does_not_take_the_frames_around_it_along(tmp_path, caplog) -> None:
+    server = with_keyframes(make_server(tmp_path / "run"))
+    worked(server)
+    (tmp_path / "run" / "dense" / "depth" / "000001").write_bytes(b"broken")
+    server.handle(between())
+    assert worked(server).views.max() == KEYFRAMES + 1
+    assert "frames are judged without it" in caplog.text
+
+
 # --- files ---------------------------------------------------------------------------------------
 
 
@@ -239,6 +265,16 @@ def test_after_a_full_disk_the_surface_is_begun_again(small_disk, caplog, monkey
     assert "the surface is made of keyframes alone" in caplog.text
     assert (grown.frames, grown.surface.views.max()) == (0, KEYFRAMES)
     server.growing._end()  # the disk is unmounted
+
+
+def test_a_surface_that_is_begun_after_the_run_folder_was_renamed_has_its_frames(tmp_path) -> None:
+    """As that of the last process, which is made at the end, or that after a full disk."""
+    server = with_keyframes(make_server(tmp_path / "run"))
+    server.handle(between())
+    (tmp_path / "run").rename(tmp_path / "renamed")
+    server.handle(RunMoved(tmp_path / "renamed"))
+    grown = server.growing.finish()
+    assert (grown.frames, grown.surface.views.max()) == (1, KEYFRAMES + 1)
 
 
 # --- which frames --------------------------------------------------------------------------------

@@ -227,3 +227,13 @@ def test_after_giving_up_all_keyframes_are_reported_as_skipped(dense) -> None:
     failure = dense.finish(world, FrameHistory(), 0).failure
     assert dense.finish(world, FrameHistory(), 5.0) == replace(MapWritten(), failure=failure)
     assert dense.finish(world, FrameHistory(), 5.0).failure
+
+
+def test_the_last_process_grows_no_surface_though_the_run_folder_moved(dense) -> None:
+    world, worker = a_map(1), process(dense)
+    for _ in range(2):
+        worker.crashes_next = True
+        dense.update(world, no, no)
+    dense.follow(Path("moved"))
+    (setup,) = worker.arguments
+    assert (setup.run, setup.grows) == (Path("moved"), False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,6 +93,32 @@ def test_a_gif_loops_and_has_the_same_bytes_again(run: Path, tmp_path: Path) -> 
 def test_an_mp4_has_its_pictures_and_its_end(run: Path, tmp_path: Path) -> None:
     path = write_film(FilmOptions(run, tmp_path / "film.mp4", None, 1, 5, 200))
     assert cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT) == 5 + 2 * 5
+
+
+def test_an_mp4_that_finds_no_space_is_refused_and_the_old_one_stays(
+    run: Path, tmp_path: Path
+) -> None:
+    options = FilmOptions(run, tmp_path / "film.mp4", None, 1, 5, 200)
+    before = write_film(options).read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))
+    try:
+        with pytest.raises(InputError, match=r"film\.mp4: cannot be written whole"):
+            write_film(options)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert options.path.read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+
+
+def test_a_ceiling_is_shown_where_there_is_nothing_else() -> None:
+    """A camera that looks straight up: all it sees is far above it."""
+    shots = [shot(k, wall(2.0), (0.1 * k, 0, 0)) for k in range(3)]
+    cloud = make_cloud(shots, CAMERA, Path("no dense map"))
+    poses = np.stack([s.T_world_camera for s in shots])
+    view = make_view(cloud, poses, np.array([0.0, 0.0, 1.0]), (80, 60))
+    assert len(view.cloud.points_world) == len(cloud.points_world) > 0
+    assert np.isfinite(view.pose(0.0)).all()
 
 
 def test_what_makes_no_film_is_refused(run: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import html.parser
 import json
 import re
@@ -104,6 +105,17 @@ def test_what_is_broken_is_named_and_what_is_missing_left_out(run: Path, tmp_pat
     for name in ("metrics.json", "trajectory.txt", "objects.png"):
         assert re.search(rf"copy/{re.escape(name)}\S*: ", page.text), name
     assert page.tags.count("img") == 0
+
+
+def test_a_film_that_is_none_does_not_get_into_the_page(run: Path, tmp_path: Path) -> None:
+    """As a link to a private file in a stranger's run would."""
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    (tmp_path / "private").write_text("secret")
+    (copy / "film.gif").symlink_to(tmp_path / "private")
+    written = write_run_report(copy)
+    assert base64.b64encode(b"secret").decode() not in written.read_text()
+    assert "film.gif: is no GIF" in Page(written).text
 
 
 def test_no_run_and_no_folder_are_refused(run: Path, tmp_path: Path) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from fake_run import FakeSystem, make_sequence
 from synthetic_view import CAMERA, PlaneViews, make_features
 
 from bmask_slam.cli import main
@@ -17,6 +19,10 @@ from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.live.display import Display
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.processes.dense_messages import Preview
+from bmask_slam.offline import runner
+from bmask_slam.offline.options import RunOptions
+from bmask_slam.run_folder.frame_file import read_frames
+from bmask_slam.viewer.replay_pictures import ReplayPictures
 from bmask_slam.viewer.scene import Scene, ViewOptions
 from bmask_slam.world.world_map import WorldMap
 
@@ -81,6 +87,24 @@ def test_a_window_without_its_program_is_one_line(monkeypatch) -> None:
     monkeypatch.setenv("PATH", "")
     with pytest.raises(InputError, match=r"window does not open .*--record"):
         Scene("a", ViewOptions(window=True))
+
+
+def test_a_run_whose_masks_lack_images_is_shown_without_them(tmp_path, caplog) -> None:
+    sequence = make_sequence(tmp_path / "seq")
+    run = runner.run(RunOptions(sequence, out=tmp_path / "run", quiet=True), FakeSystem).folder
+    other = {"id": 1, "file_name": "rgb/other.png", "width": 8, "height": 8}
+    content = {"images": [other], "annotations": [], "categories": [{"id": 1, "name": "cup"}]}
+    (tmp_path / "masks.json").write_text(json.dumps(content))
+    segmenter = f"{{name: precomputed, masks: {tmp_path / 'masks.json'}}}"
+    (run / "config.yaml").write_text(f"semantics: {{segmenter: {segmenter}}}")
+    frames, scene = read_frames(run / "frames.csv"), Scene("a", ViewOptions(tmp_path / "a.rrd"))
+    pictures = ReplayPictures(run, sequence, frames)
+    assert pictures.names == ("background", "cup")
+    for line, stamp_s in enumerate(frames.timestamps_s.tolist()):
+        pictures.show(line, stamp_s, scene)
+    scene.close()
+    assert "shown without masks" in caplog.text
+    assert entities(tmp_path / "a.rrd")["/world/camera/image"] == len(frames)
 
 
 def columns(path: Path, entity: str, name: str) -> list[Array]:
