@@ -51,8 +51,9 @@ class WorkstationServer:
         try:
             infos = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
             self._end = socket.create_server(infos[0][4][:2], family=infos[0][0], backlog=16)
-        except OSError as error:
-            raise InputError(f"{host}:{port}: {error.strerror or error}") from error
+        except (OSError, UnicodeError) as error:  # UnicodeError: no name of a host
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"{host}:{port}: {reason}") from error
         self.port = int(self._end.getsockname()[1])
         self._token = token
         self._closed = threading.Event()
@@ -69,8 +70,11 @@ class WorkstationServer:
                 end, address = self._end.accept()
             except TimeoutError:
                 continue
-            except OSError:  # it is closed
-                break
+            except OSError as error:  # closed, or too many files are open, or the network fails
+                if not self._closed.is_set():
+                    logger.warning("nobody can be admitted at present: %s", error)
+                    self._closed.wait(_POLL_S)
+                continue
             if not self._open.acquire(blocking=False):
                 end.close()
                 continue
@@ -137,6 +141,8 @@ def _started(end: socket.socket, keys: Keys) -> subprocess.Popen[bytes]:
 def work(descriptor: int) -> None:
     """Main function of a worker's process."""
     data = sys.stdin.buffer.read(2 * CODE_BYTES)
+    if len(data) < 2 * CODE_BYTES:  # who had the keys has ended; an empty one would be anyone's
+        return
     end = socket.socket(fileno=descriptor)
     connection = Connection(end, Keys(data[:CODE_BYTES], data[CODE_BYTES:]))
     channel = Channel(connection, None, Outbox())
