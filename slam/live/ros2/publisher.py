@@ -82,17 +82,19 @@ class Ros2Publisher:
         if self._is_due("map", PERIOD_S):
             self._publish_map(stamp_s, run)
         if self._is_due("objects", OBJECTS_S):
-            found = run.objects()
-            if found is not None and found is not self._told:
-                self._told = found
-                self._outputs.objects(stamp_s, found)
+            self._publish_objects(stamp_s, run)
         if self._is_due("grid", GRID_S):
             self._publish_grid(stamp_s, run)
 
     def finish(self, run: LiveRun) -> None:
-        """Publish path and landmarks of a run that has ended, as they were optimised at its end."""
-        if run is self._run:  # else it has tracked nothing
-            self._publish_map(self._ros_time(self._last_s), run)
+        """Publish everything of a run that has ended, as it was optimised at its end."""
+        if run is not self._run:  # it has tracked nothing
+            return
+        stamp_s = self._ros_time(self._last_s)
+        self._publish_map(stamp_s, run)
+        self._publish_objects(stamp_s, run)
+        wait([self._making] if self._making else [])
+        self._make_grid(stamp_s, run.keyframe_poses())
 
     def _begin(self) -> None:
         """Nothing is known of a run's map yet, and everything is due."""
@@ -136,6 +138,12 @@ class Ros2Publisher:
         health = asdict(run.health())
         counts = health.pop("source")
         self._outputs.health(stamp_s, health | counts)
+
+    def _publish_objects(self, stamp_s: float, run: LiveRun) -> None:
+        found = run.objects()
+        if found is not None and found is not self._told:
+            self._told = found
+            self._outputs.objects(stamp_s, found)
 
     def _publish_grid(self, stamp_s: float, run: LiveRun) -> None:
         """Let a thread make the grid, unless it still makes the one before."""
