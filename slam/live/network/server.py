@@ -59,6 +59,7 @@ class WorkstationServer:
         self._closed = threading.Event()
         self._children: list[_Child] = []
         self._open = threading.Semaphore(MAX_HANDSHAKES)
+        self._waiting: list[socket.socket] = []  # for their handshakes, the oldest first
         self._handshakes = ThreadPoolExecutor(MAX_HANDSHAKES, "handshake")
 
     def serve(self, ends: Callable[[], bool] = lambda: False) -> None:
@@ -75,9 +76,11 @@ class WorkstationServer:
                     logger.warning("nobody can be admitted at present: %s", error)
                     self._closed.wait(_POLL_S)
                 continue
-            if not self._open.acquire(blocking=False):
-                end.close()
-                continue
+            if not self._open.acquire(blocking=False):  # who knows the token needs no time
+                for oldest in self._waiting[:1]:
+                    _end(oldest)
+                self._open.acquire()
+            self._waiting.append(end)
             self._handshakes.submit(self._admit, end, str(address[0]))
 
     def close(self) -> None:
@@ -97,6 +100,7 @@ class WorkstationServer:
             with closing(end):
                 end.settimeout(HANDSHAKE_S)
                 keys = admit(end, self._token)
+                self._waiting.remove(end)
                 timer.cancel()
                 if keys is None:
                     logger.warning("%s: refused; another token or version", robot)
@@ -108,6 +112,8 @@ class WorkstationServer:
             logger.info("%s: gone before it was admitted (%s)", robot, error)
         finally:
             timer.cancel()
+            if end in self._waiting:
+                self._waiting.remove(end)
             self._open.release()
 
     def _reap(self) -> None:

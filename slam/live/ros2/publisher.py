@@ -19,6 +19,7 @@ from bmask_slam.labelling.results import LandmarkCloud, MapObjects
 from bmask_slam.live.ros2.grid import GridOptions, LiveCloud, LiveGrid
 from bmask_slam.live.ros2.outputs import Robot, Ros2Frames, Ros2Outputs
 from bmask_slam.live.ros2.transport import Node
+from bmask_slam.mapping.products.occupancy import UNKNOWN, OccupancyGrid
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 logger = logging.getLogger(__name__)
@@ -66,6 +67,7 @@ class Ros2Publisher:
         self._run: LiveRun | None = None
         self._last_s = 0.0
         self._told: MapObjects | None = None
+        self._has_grid = False
 
     def __call__(self, result: FrameResult, run: LiveRun) -> None:
         """Publish a result, and what is due."""
@@ -112,6 +114,11 @@ class Ros2Publisher:
             self._outputs.objects(stamp_s, replace(self._told, objects=[]))
         none = np.zeros((0, 3))
         self._outputs.cloud(stamp_s, none, none.astype(np.uint8))
+        if self._has_grid:
+            unknown = np.full((1, 1), UNKNOWN, np.int8)
+            nothing = OccupancyGrid(self._grid_options.resolution_m, np.zeros(2), unknown)
+            self._outputs.grid(stamp_s, nothing, 0.0)
+            self._has_grid = False
 
     def _add_submap(self, number: int, points: Floats, colours: Bytes) -> None:
         self._grid.add(number, points)
@@ -161,6 +168,7 @@ class Ros2Publisher:
         found = self._grid.grid(poses)
         if found is not None:
             self._outputs.grid(stamp_s, *found)
+            self._has_grid = True
         cloud = self._cloud.cloud(poses)
         if cloud is not None:
             self._outputs.cloud(stamp_s, *cloud)

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -156,6 +156,17 @@ def test_who_is_silent_is_dropped(cut, monkeypatch) -> None:
     with socket.create_connection(("127.0.0.1", cut.port)) as end:
         end.settimeout(10)
         assert end.recv(1) == b""
+
+
+def test_who_is_silent_keeps_nobody_out(cut) -> None:
+    """Strangers that hold all places, and come again."""
+    address = "127.0.0.1", cut._to
+    with ExitStack() as strangers:
+        for _ in range(3 * server_module.MAX_HANDSHAKES):
+            strangers.enter_context(socket.create_connection(address))
+        with socket.create_connection(address) as end:
+            end.settimeout(60)
+            assert introduce(end, TOKEN).sending
 
 
 def test_another_version_is_said() -> None:

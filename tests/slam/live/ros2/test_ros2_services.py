@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("cyclonedds")
 
 from test_ros2 import LOOPBACK
-from test_ros2_maps import T_MAP_WORLD, Run, some_objects
+from test_ros2_maps import T_MAP_WORLD, Run, room, some_objects
 from test_ros2_sensors import StandIn
 
 from bmask_slam.cli import main
@@ -210,11 +210,13 @@ def test_another_run_begins_with_an_empty_map() -> None:
     second.objects = lambda: None  # type: ignore[assignment, return-value, method-assign]
     result = FrameResult(0, 5.0, TrackingStatus.OK, np.eye(4), 0)
     publish(result, first)
-    first.listeners[0](4, np.ones((5, 3), np.float32), np.zeros((5, 3), np.uint8))
+    first.listeners[0](4, room(2.02), np.zeros((len(room(2.02)), 3), np.uint8))
     assert publish._making is not None
     publish._making.result(10)
     publish._make_grid(5.0, {4: make_pose(np.eye(3), np.zeros(3))})
     assert ros.topics["/bmask_slam/cloud"][-1].width >= 1
+    assert ros.topics["/bmask_slam/map"][-1].info.width > 20
     publish(result, second)
     assert ros.topics["/bmask_slam/cloud"][-1].width == 0
+    assert ros.topics["/bmask_slam/map"][-1].data.tolist() == [-1]
     assert [len(m.markers) for m in ros.topics["/bmask_slam/object_markers"]] == [3, 1]
