@@ -18,6 +18,7 @@ logger = logging.getLogger(__name__)
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
 SAVE_S = 60.0
 """Longest time that the map's process may take to save the map."""
+ENDED = "the run has ended"
 
 
 class ServedRun(Protocol):
@@ -74,6 +75,18 @@ class Ros2Services:
         for request in self._resetting:
             _reply(request, True, f"the run until now is in {before}, the new one in {now}")
         self._saving, self._resetting, self.reset_asked = [], [], False
+
+    def end(self, run: Path | None) -> None:
+        """The run has ended, and no other begins; answers who still waits."""
+        saved = None if run is None else run.absolute() / MAP
+        is_saved = saved is not None and saved.exists()
+        for saving in self._saving:
+            _reply(saving.request, is_saved, str(saved) if is_saved else ENDED)
+        for request in [*self._resetting, *self._save.take(), *self._reset.take()]:
+            _reply(request, False, ENDED)
+        for request in self._localise.take():
+            _reply(request, False, ENDED, kind=SET_BOOL)
+        self._saving, self._resetting = [], []
 
     def _begin_saving(self, run: ServedRun, request: Request) -> None:
         if run.out is None:

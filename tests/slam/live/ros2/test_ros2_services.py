@@ -28,7 +28,7 @@ from bmask_slam.live.ros2.dds import CALL_BYTES, HEADER_BYTES, DdsService, carri
 from bmask_slam.live.ros2.grid import LiveCloud
 from bmask_slam.live.ros2.outputs import Robot, Ros2Frames
 from bmask_slam.live.ros2.publisher import Ros2Publisher
-from bmask_slam.live.ros2.services import SAVE_S, Ros2Services
+from bmask_slam.live.ros2.services import ENDED, SAVE_S, Ros2Services
 from bmask_slam.live.ros2.transport import encoded, typestore
 from bmask_slam.run_folder.map_file import read_map
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
@@ -135,6 +135,24 @@ def test_a_map_is_saved_or_it_is_said_why_not(monkeypatch) -> None:
     assert not services.reset_asked
     assert reset.answers == [(True, "the run until now is in a, the new one in b")]
     assert calls[4].answers == [(False, "the run ended before its map was saved")]
+
+
+def test_who_waits_at_the_end_is_answered(tmp_path: Path) -> None:
+    for folder, answer in ((tmp_path, (True, str(tmp_path / "map"))), (None, (False, ENDED))):
+        (tmp_path / "map").touch()
+        ros, run = node(), Served(out=tmp_path)
+        services = Ros2Services(ros, "/x")
+        save, reset, late = (Call(TRIGGER(0)) for _ in range(3))
+        ros.calls["save_map"] += [save]
+        services.serve(run)
+        ros.calls["reset"] += [reset]
+        services.serve(run)
+        ros.calls["save_map"] += [late]
+        only = Call(SET_BOOL(True))
+        ros.calls["localise_only"] += [only]
+        services.end(folder)
+        assert save.answers == [answer]
+        assert reset.answers == late.answers == only.answers == [(False, ENDED)]
 
 
 def test_a_call_has_its_number_before_its_fields() -> None:
