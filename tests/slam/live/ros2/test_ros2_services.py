@@ -137,6 +137,27 @@ def test_a_map_is_saved_or_it_is_said_why_not(monkeypatch) -> None:
     assert calls[4].answers == [(False, "the run ended before its map was saved")]
 
 
+def test_many_calls_save_few_maps() -> None:
+    """The map's process is kept busy by nobody; each answer is of a map saved after its call."""
+    ros, run, asked = node(), Served(), []  # type: ignore[var-annotated]
+    run.save_map = asked.append
+    services, calls = Ros2Services(ros, "/x"), [Call(TRIGGER(0)) for _ in range(101)]
+    ros.calls["save_map"] += calls[:1]
+    services.serve(run)
+    for call in calls[1:]:
+        ros.calls["save_map"] += [call]
+        services.serve(run)
+    assert asked == [Path("/run/map")]
+    run.saved = (MapSaved(asked[0]),)
+    services.serve(run)
+    assert [len(call.answers) for call in calls] == [1] + 100 * [0]
+    assert len(asked) == 2
+    run.saved = (MapSaved(asked[1]),)
+    services.serve(run)
+    assert {tuple(call.answers) for call in calls} == {((True, "/run/map"),)}
+    assert len(asked) == 2
+
+
 def test_who_waits_at_the_end_is_answered(tmp_path: Path) -> None:
     for folder, answer in ((tmp_path, (True, str(tmp_path / "map"))), (None, (False, ENDED))):
         (tmp_path / "map").touch()
