@@ -113,9 +113,8 @@ def _workstation(arguments: argparse.Namespace) -> int:
         raise InputError(f"--port {arguments.port}: no port")
     server = WorkstationServer(arguments.host, arguments.port, read_token(path))
     print(f"listening on {arguments.host}:{server.port}; Ctrl-C ends it", flush=True)
-    with StopRequest() as stop:
+    with closing(server), StopRequest() as stop:
         server.serve(lambda: stop.signal is not None)
-    server.close()
     return 128 + stop.signal if stop.signal else 0
 
 
@@ -181,7 +180,6 @@ def _live_on(arguments: argparse.Namespace, source: Source) -> int:
     if ros2 is not None:
         config = replace(config, sensors=ros2.mounted(config.sensors))
     listener, services = (None, None) if ros2 is None else ros2_ends(ros2, arguments.ros2_params)
-    told = PlayOptions(not source.waits, quiet=arguments.quiet)
     before: Path | None = None
     while True:
         with LiveSlam(source.camera, config, options) as slam:
@@ -190,14 +188,16 @@ def _live_on(arguments: argparse.Namespace, source: Source) -> int:
                 ros2.deliver = slam.add_measurements
             for measured in measured_beside(arguments, options.images, config):
                 slam.add_measurements(measured)
-            for address in slam.viewer_addresses:
-                print(address, file=sys.stderr, flush=True)
+            sys.stderr.writelines(f"{address}\n" for address in slam.viewer_addresses)
             if services is not None and services.reset_asked:
                 services.begin(before, slam.out)
+            told = PlayOptions(not source.waits, quiet=arguments.quiet)
             ended_by = play(slam, source, told, listener, services)
         if listener is not None:
             listener.finish(slam)
         if ended_by or services is None or not services.reset_asked:
+            if services is not None:
+                services.end(slam.out)
             return _tell(arguments, slam, source, ended_by)
         before, options = slam.out, _next_run(options)
 

@@ -102,6 +102,11 @@ class Channel:
         """Receive what the other side sent before it ended."""
         self._reader.join(timeout_s)
 
+    def join(self) -> None:
+        """Wait until both directions have ended, after which the connection may be closed."""
+        self._sender.join()
+        self._reader.join()
+
     def close(self) -> None:
         """End both directions at once."""
         self.open = False

@@ -73,21 +73,26 @@ class LiveMap(SensorInput):
 
     def segment(self) -> int:
         """The number of the largest map segment, which ``map`` and ``trajectory`` are of."""
-        return self._system.remote.world.largest_segment()
+        return self._system.map.world.largest_segment()
 
     def keyframe_poses(self) -> dict[int, Array]:
         """The present T_world_camera (4, 4) of the keyframes of the largest segment, by id."""
-        world = self._system.remote.world
+        world = self._system.map.world
         return {k.id: k.T_world_camera for k in world.in_segment(world.largest_segment())}
 
     def objects(self) -> MapObjects | None:
         """The objects as the map's process told them last; it is asked for newer ones.
 
-        None before its first answer, and without a segmenter.
+        None before its first answer, and without a segmenter. After ``close`` those that are saved.
         """
-        if self._system.segmenter is not None:
-            self._system.remote.ask_for_objects()
-        return self._system.remote.objects
+        system = self._system
+        if system.segmenter is None:
+            return None
+        if system.map is not system.remote:  # it has ended
+            world = system.map.world
+            return system.semantics.map_objects(world.in_segment(world.largest_segment()))
+        system.remote.ask_for_objects()
+        return system.remote.objects
 
     def on_submap(self, listener: Callable[[int, Floats, Bytes], None]) -> None:
         """Call with each submap of the dense map: its keyframe's id, points (N, 3) and colours.

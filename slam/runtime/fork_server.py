@@ -16,26 +16,23 @@ import pickle
 import select
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NoReturn
 
+from bmask_slam.runtime.forked_process import NUMBER, ForkedProcess
 from bmask_slam.runtime.stop_request import SIGNALS
 
 logger = logging.getLogger(__name__)
 
 IS_SUPPORTED = sys.platform == "linux"
 STANDARD_STREAMS = (1, 2)
-PATIENCE_S = 5.0
-"""Longest time for which the end of a process waits that the server has yet to start."""
-_NUMBER = struct.Struct("<i")
-_POLL_S = 0.02
+MAX_PASSED = 16
+"""Largest number of descriptors of a request."""
 
 
 @dataclass(frozen=True)
@@ -53,72 +50,6 @@ class Start:
     folder: str
 
 
-class ForkedProcess:
-    """A process that the server has started; its methods are those of ``subprocess.Popen``."""
-
-    def __init__(self, server: ForkServer, status: int) -> None:
-        """Take the read end of a pipe, on which the server says the pid, then the exit code."""
-        self._server, self._status = server, status
-        self._pid: int | None = None
-        self._code: int | None = None
-        self._lock = threading.RLock()
-
-    def __del__(self) -> None:
-        with suppress(OSError):
-            os.close(self._status)
-
-    @property
-    def pid(self) -> int:
-        """Process id, 0 if it could not be started; waits for it while the server loads."""
-        with self._lock:
-            if self._pid is None:
-                self._pid = self._next_number() or 0
-            return self._pid
-
-    def poll(self) -> int | None:
-        """The exit code, negative for a signal's number; None while it runs."""
-        with self._lock:
-            while self._code is None and select.select([self._status], [], [], 0)[0]:
-                if self._pid is None:
-                    self._pid = self._next_number() or 0
-                    continue
-                self._code = self._next_number()
-                if self._code is None:  # the server has ended, so nobody knows its exit code
-                    if self._is_there():
-                        break
-                    self._code = -signal.SIGKILL
-            return self._code
-
-    def wait(self, timeout_s: float | None = None) -> int:
-        """Wait for its end. Raises subprocess.TimeoutExpired."""
-        end_s = None if timeout_s is None else time.monotonic() + timeout_s
-        while (code := self.poll()) is None:
-            if end_s is not None and time.monotonic() > end_s:
-                raise subprocess.TimeoutExpired("a forked process", timeout_s or 0.0)
-            select.select([self._status], [], [], _POLL_S)
-        return code
-
-    def kill(self) -> None:
-        """Kill it, unless it has ended; a server that does not answer is killed for it."""
-        with self._lock:
-            if self._pid is None and not select.select([self._status], [], [], PATIENCE_S)[0]:
-                self._server.close()
-        if self.pid and self.poll() is None:
-            with suppress(ProcessLookupError):
-                os.kill(self.pid, signal.SIGKILL)
-
-    def _next_number(self) -> int | None:
-        data = os.read(self._status, _NUMBER.size)
-        return int(_NUMBER.unpack(data)[0]) if data else None
-
-    def _is_there(self) -> bool:
-        with suppress(ProcessLookupError):
-            if self._pid:
-                os.kill(self._pid, 0)
-                return True
-        return False
-
-
 class ForkServer:
     """The owner's end of a server, which ends with its owner."""
 
@@ -130,6 +61,8 @@ class ForkServer:
             self._process = subprocess.Popen(  # nosec B603 # this module, by number of descriptor
                 [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"],
                 stdin=other_end.fileno(),
+                stdout=None if _has_stream(1) else subprocess.DEVNULL,
+                stderr=None if _has_stream(2) else subprocess.DEVNULL,
                 env=dict(environment),
                 process_group=0,  # Ctrl-C in a terminal must reach only the owner
             )
@@ -154,15 +87,15 @@ class ForkServer:
             OSError: the server has ended.
         """
         read_end, write_end = os.pipe()
-        process = ForkedProcess(self, read_end)
-        streams = [_open_stream(number) for number in STANDARD_STREAMS]
+        process = ForkedProcess(self.close, read_end)
+        passed = [write_end]
         try:
-            data = pickle.dumps(start)
-            passed = [write_end, *streams, *descriptors]
-            socket.send_fds(self._control, [_NUMBER.pack(len(data))], passed)
-            self._control.sendall(data)
+            passed.append(_in_memory(pickle.dumps(start)))
+            for number in STANDARD_STREAMS:
+                passed.append(_open_stream(number))
+            socket.send_fds(self._control, [b"\0"], [*passed, *descriptors])
         finally:
-            for number in (write_end, *streams):
+            for number in passed:
                 os.close(number)
         return process
 
@@ -177,12 +110,30 @@ class _Shared:
 def start_forked(start: Start, descriptors: Sequence[int]) -> ForkedProcess:
     """Start a process by this process's one server, which is started when it is first needed."""
     with _Shared.lock:
-        if _Shared.server is not None and _Shared.server.is_running:
-            with suppress(OSError):  # it ends just now
-                return _Shared.server.start(start, descriptors)
+        if _Shared.server is not None:
+            if _Shared.server.is_running:
+                with suppress(OSError):  # it ends just now
+                    return _Shared.server.start(start, descriptors)
+            _Shared.server.close()
         _Shared.server = ForkServer(start.environment)
-        atexit.register(_Shared.server.close)
         return _Shared.server.start(start, descriptors)
+
+
+def _close_shared() -> None:
+    """Let the server end, at the end of its owner."""
+    if _Shared.server is not None:
+        _Shared.server.close()
+
+
+def _forget_shared() -> None:
+    """A process that the owner forks by itself has no server, nor keeps its owner's alive."""
+    _close_shared()
+    _Shared.server, _Shared.lock = None, threading.Lock()
+
+
+if IS_SUPPORTED:
+    atexit.register(_close_shared)
+    os.register_at_fork(after_in_child=_forget_shared)
 
 
 def server_pid() -> int | None:
@@ -190,12 +141,26 @@ def server_pid() -> int | None:
     return None if _Shared.server is None else _Shared.server.pid
 
 
+def _has_stream(number: int) -> bool:
+    """Whether this program was started with it; else its number may be any file's by now."""
+    return (sys.__stdin__, sys.__stdout__, sys.__stderr__)[number] is not None
+
+
 def _open_stream(number: int) -> int:
-    """A copy of a standard stream; of nothing, where the owner has closed it."""
-    try:
-        return os.dup(number)
-    except OSError:
-        return os.open(os.devnull, os.O_WRONLY)
+    """A copy of a standard stream; of nothing, where the owner has none."""
+    if _has_stream(number):
+        with suppress(OSError):  # it is closed meanwhile
+            return os.dup(number)
+    return os.open(os.devnull, os.O_WRONLY)
+
+
+def _in_memory(data: bytes) -> int:
+    """A file that holds data of any size, so that sending it waits for nobody."""
+    descriptor = os.memfd_create("bmask-slam")
+    with os.fdopen(descriptor, "wb", closefd=False) as file:
+        file.write(data)
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    return descriptor
 
 
 def serve() -> None:
@@ -253,25 +218,27 @@ def _fork(
 
 def _receive(control: socket.socket) -> tuple[Start, list[int]] | None:
     """The next request and its descriptors; None once the owner has ended."""
-    size, descriptors, _, _ = socket.recv_fds(control, _NUMBER.size, 16)
-    if not size:
+    said, passed, _, _ = socket.recv_fds(control, 1, MAX_PASSED)
+    if not said:
         return None
-    data = control.recv(_NUMBER.unpack(size)[0], socket.MSG_WAITALL)
-    return pickle.loads(data), descriptors  # nosec B301 # from the owner
+    status, asked, *inherited = passed
+    with os.fdopen(asked, "rb") as file:
+        return pickle.load(file), [status, *inherited]  # nosec B301 # from the owner
 
 
 def _report_ended(statuses: dict[int, int]) -> None:
     """Tell the owner the exit codes of the processes that have ended."""
     with suppress(ChildProcessError):
         while (ended := os.waitpid(-1, os.WNOHANG))[0]:
-            status = statuses.pop(ended[0])
-            _write(status, os.waitstatus_to_exitcode(ended[1]))
-            os.close(status)
+            status = statuses.pop(ended[0], None)
+            if status is not None:  # else a library has started it
+                _write(status, os.waitstatus_to_exitcode(ended[1]))
+                os.close(status)
 
 
 def _write(status: int, number: int) -> None:
     with suppress(OSError):  # the owner no longer listens
-        os.write(status, _NUMBER.pack(number))
+        os.write(status, NUMBER.pack(number))
 
 
 def _run(start: Start, passed: Sequence[int]) -> NoReturn:

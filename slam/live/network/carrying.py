@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Condition
@@ -125,5 +126,7 @@ def store(piece: FilePiece, fail: Callable[[OSError], Any]) -> Any | None:
         if piece.message is not None:
             os.replace(part, piece.path)
     except OSError as error:
+        with suppress(OSError):  # without its beginning, no later piece makes a file of it
+            part.unlink()
         return fail(error) if piece.message is not None else None
     return piece.message

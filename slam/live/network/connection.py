@@ -158,6 +158,10 @@ class Connection:
         """The descriptor."""
         return self._end.fileno()
 
+    def close(self) -> None:
+        """Give the descriptor back; nobody may wait for data any more."""
+        self._end.close()
+
     @property
     def silent_s(self) -> float:
         """For how long the other system has acknowledged nothing of what was sent again.

@@ -51,13 +51,15 @@ class WorkstationServer:
         try:
             infos = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
             self._end = socket.create_server(infos[0][4][:2], family=infos[0][0], backlog=16)
-        except OSError as error:
-            raise InputError(f"{host}:{port}: {error.strerror or error}") from error
+        except (OSError, UnicodeError) as error:  # UnicodeError: no name of a host
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"{host}:{port}: {reason}") from error
         self.port = int(self._end.getsockname()[1])
         self._token = token
         self._closed = threading.Event()
         self._children: list[_Child] = []
         self._open = threading.Semaphore(MAX_HANDSHAKES)
+        self._waiting: list[socket.socket] = []  # for their handshakes, the oldest first
         self._handshakes = ThreadPoolExecutor(MAX_HANDSHAKES, "handshake")
 
     def serve(self, ends: Callable[[], bool] = lambda: False) -> None:
@@ -69,11 +71,16 @@ class WorkstationServer:
                 end, address = self._end.accept()
             except TimeoutError:
                 continue
-            except OSError:  # it is closed
-                break
-            if not self._open.acquire(blocking=False):
-                end.close()
+            except OSError as error:  # closed, or too many files are open, or the network fails
+                if not self._closed.is_set():
+                    logger.warning("nobody can be admitted at present: %s", error)
+                    self._closed.wait(_POLL_S)
                 continue
+            if not self._open.acquire(blocking=False):  # who knows the token needs no time
+                for oldest in self._waiting[:1]:
+                    _end(oldest)
+                self._open.acquire()
+            self._waiting.append(end)
             self._handshakes.submit(self._admit, end, str(address[0]))
 
     def close(self) -> None:
@@ -93,6 +100,7 @@ class WorkstationServer:
             with closing(end):
                 end.settimeout(HANDSHAKE_S)
                 keys = admit(end, self._token)
+                self._waiting.remove(end)
                 timer.cancel()
                 if keys is None:
                     logger.warning("%s: refused; another token or version", robot)
@@ -104,6 +112,8 @@ class WorkstationServer:
             logger.info("%s: gone before it was admitted (%s)", robot, error)
         finally:
             timer.cancel()
+            if end in self._waiting:
+                self._waiting.remove(end)
             self._open.release()
 
     def _reap(self) -> None:
@@ -137,6 +147,8 @@ def _started(end: socket.socket, keys: Keys) -> subprocess.Popen[bytes]:
 def work(descriptor: int) -> None:
     """Main function of a worker's process."""
     data = sys.stdin.buffer.read(2 * CODE_BYTES)
+    if len(data) < 2 * CODE_BYTES:  # who had the keys has ended; an empty one would be anyone's
+        return
     end = socket.socket(fileno=descriptor)
     connection = Connection(end, Keys(data[:CODE_BYTES], data[CODE_BYTES:]))
     channel = Channel(connection, None, Outbox())

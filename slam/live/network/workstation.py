@@ -38,16 +38,32 @@ class Traffic:
     """Bytes on the wire since the start, of all connections that have been."""
 
     connections: list[Connection] = field(default_factory=list)
+    _ended: tuple[int, int] = (0, 0)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def add(self, connection: Connection) -> None:
+        """Count a connection; of those that are closed only the bytes are kept."""
+        with self._lock:
+            closed = [one for one in self.connections if one.fileno() < 0]
+            sent, received = self._ended
+            self._ended = (
+                sent + sum(one.sent_bytes for one in closed),
+                received + sum(one.received_bytes for one in closed),
+            )
+            self.connections = [one for one in self.connections if one not in closed]
+            self.connections.append(connection)
 
     @property
     def sent_bytes(self) -> int:
         """To the workstation."""
-        return sum(one.sent_bytes for one in self.connections)
+        with self._lock:
+            return self._ended[0] + sum(one.sent_bytes for one in self.connections)
 
     @property
     def received_bytes(self) -> int:
         """From it."""
-        return sum(one.received_bytes for one in self.connections)
+        with self._lock:
+            return self._ended[1] + sum(one.received_bytes for one in self.connections)
 
 
 @dataclass(frozen=True)
@@ -104,12 +120,13 @@ class Workstation:
             except BaseException:
                 end.close()
                 raise
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # UnicodeError: no name of a host
+            reason = getattr(error, "strerror", None) or error
             raise InputError(
-                f"{where} cannot be reached ({error.strerror or error}); does "
+                f"{where} cannot be reached ({reason}); does "
                 "bmask-slam workstation --host ADDRESS run there?"
             ) from error
-        self.traffic.connections.append(connection)
+        self.traffic.add(connection)
         data = None if state is None else file_data(state)
         return DistantEnd(connection, (name, arguments, data))
 
@@ -127,10 +144,13 @@ class DistantEnd:
         threading.Thread(target=self._beat, name="beat", daemon=True).start()
 
     def _beat(self) -> None:
+        """Show that this end lives; when it has ended, give its descriptor back."""
         with suppress(OSError):
             while self._channel.open:
                 self._connection.beat()
                 time.sleep(BEAT_S)
+        self._channel.join()
+        self._connection.close()
 
     @property
     def is_running(self) -> bool:

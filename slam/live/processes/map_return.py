@@ -89,6 +89,8 @@ class MapReturn:
                 break
             if any(isinstance(message, Ready) for message in found):
                 self._ready = end, found
+                if self._closed.is_set():  # just now; ``close`` may not have seen it
+                    end.kill()
                 return True
         end.kill()
         return False

@@ -30,7 +30,8 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.live.channel import Channel, ForwardedLog
 from bmask_slam.live.shared_memory import SIZE, Ring, anonymous_file
 from bmask_slam.runtime import fork_server
-from bmask_slam.runtime.fork_server import ForkedProcess, Start
+from bmask_slam.runtime.fork_server import Start
+from bmask_slam.runtime.forked_process import ForkedProcess
 from bmask_slam.runtime.stop_request import SIGNALS
 
 logger = logging.getLogger(__name__)
@@ -126,7 +127,9 @@ class Worker:
 
     @property
     def processor_s(self) -> float:
-        """The processor's time that it has used; 0 where the system does not say."""
+        """The processor's time that it has used; 0 where the system does not say, or not yet."""
+        if isinstance(self._process, ForkedProcess) and not self._process.has_begun:
+            return 0.0
         try:
             words = Path(f"/proc/{self.pid}/stat").read_text().rsplit(")", 1)[1].split()
         except OSError:
@@ -183,7 +186,7 @@ def _started(target: str, descriptors: list[int]) -> ForkedProcess | subprocess.
             module if is_own else __name__,
             environment,
             environment["PYTHONPATH"].split(os.pathsep),
-            os.getcwd(),
+            _current_folder(),
         )
         return fork_server.start_forked(start, descriptors)
     return subprocess.Popen(  # nosec B603 # this module, by number of descriptors
@@ -195,17 +198,26 @@ def _started(target: str, descriptors: list[int]) -> ForkedProcess | subprocess.
     )
 
 
+def _current_folder() -> str:
+    """Its path, empty if it has been removed."""
+    with suppress(FileNotFoundError):
+        return os.getcwd()
+    return ""
+
+
 def safe_import_path() -> dict[str, str]:
     """Environment of a child that imports from this process's folders but the current one.
 
     The current folder may hold foreign files, such as a downloaded recording with a ``queue.py``.
     It is kept where its user names it in PYTHONPATH.
     """
-    here = os.path.realpath(os.curdir)
-    given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    named = here in {os.path.realpath(p) for p in given if p}
     folders = [p for p in sys.path if os.path.isabs(p)]
-    folders = [p for p in folders if named or os.path.realpath(p) != here]
+    here = _current_folder()
+    if here:
+        here = os.path.realpath(here)
+        given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+        named = here in {os.path.realpath(p) for p in given if p}
+        folders = [p for p in folders if named or os.path.realpath(p) != here]
     return {"PYTHONPATH": os.pathsep.join(folders), "PYTHONSAFEPATH": "1"}
 
 

@@ -72,14 +72,12 @@ class LiveGrid:
     def grid(self, poses: dict[int, Array]) -> tuple[OccupancyGrid, float] | None:
         """The grid by T_world_camera (4, 4) of the keyframes in the map, and the floor's height.
 
-        Seen from above in the map's frame; None while nothing is known.
+        Seen from above in the map's frame; None while nothing is known. Submaps of other keyframes
+        are kept: those of another map segment are in the map once the two are joined.
         """
         for number in list(self._new):
             self._submaps[number] = _Submap(self._new.pop(number))
-        for number in self._submaps.keys() - poses.keys():
-            if number not in self._new:
-                del self._submaps[number]
-        known = {n: submap for n, submap in self._submaps.items() if len(submap.points)}
+        known = {n: s for n, s in self._submaps.items() if n in poses and len(s.points)}
         if not known:
             return None
         floor_m = self._floor_m(known, poses)

@@ -65,8 +65,10 @@ class Ros2Frames:
     cloud_voxel_m: float = 0.03
 
     def __post_init__(self) -> None:
-        if not self.cloud_voxel_m > 0:
-            raise InputError(f"cloud_voxel_m: {self.cloud_voxel_m:g} is no edge of a cube")
+        for name in ("cloud_voxel_m", "grid_resolution_m"):
+            edge_m = getattr(self, name)
+            if not 0 < edge_m < np.inf:
+                raise InputError(f"{name}: {edge_m:g} is no edge of a cube")
         if self.base_camera:
             T = np.array(self.base_camera)
             good = T.size == 16 and np.isfinite(T).all()

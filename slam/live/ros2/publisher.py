@@ -19,6 +19,7 @@ from bmask_slam.labelling.results import LandmarkCloud, MapObjects
 from bmask_slam.live.ros2.grid import GridOptions, LiveCloud, LiveGrid
 from bmask_slam.live.ros2.outputs import Robot, Ros2Frames, Ros2Outputs
 from bmask_slam.live.ros2.transport import Node
+from bmask_slam.mapping.products.occupancy import UNKNOWN, OccupancyGrid
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 logger = logging.getLogger(__name__)
@@ -66,6 +67,7 @@ class Ros2Publisher:
         self._run: LiveRun | None = None
         self._last_s = 0.0
         self._told: MapObjects | None = None
+        self._has_grid = False
 
     def __call__(self, result: FrameResult, run: LiveRun) -> None:
         """Publish a result, and what is due."""
@@ -82,17 +84,19 @@ class Ros2Publisher:
         if self._is_due("map", PERIOD_S):
             self._publish_map(stamp_s, run)
         if self._is_due("objects", OBJECTS_S):
-            found = run.objects()
-            if found is not None and found is not self._told:
-                self._told = found
-                self._outputs.objects(stamp_s, found)
+            self._publish_objects(stamp_s, run)
         if self._is_due("grid", GRID_S):
             self._publish_grid(stamp_s, run)
 
     def finish(self, run: LiveRun) -> None:
-        """Publish path and landmarks of a run that has ended, as they were optimised at its end."""
-        if run is self._run:  # else it has tracked nothing
-            self._publish_map(self._ros_time(self._last_s), run)
+        """Publish everything of a run that has ended, as it was optimised at its end."""
+        if run is not self._run:  # it has tracked nothing
+            return
+        stamp_s = self._ros_time(self._last_s)
+        self._publish_map(stamp_s, run)
+        self._publish_objects(stamp_s, run)
+        wait([self._making] if self._making else [])
+        self._make_grid(stamp_s, run.keyframe_poses())
 
     def _begin(self) -> None:
         """Nothing is known of a run's map yet, and everything is due."""
@@ -110,6 +114,11 @@ class Ros2Publisher:
             self._outputs.objects(stamp_s, replace(self._told, objects=[]))
         none = np.zeros((0, 3))
         self._outputs.cloud(stamp_s, none, none.astype(np.uint8))
+        if self._has_grid:
+            unknown = np.full((1, 1), UNKNOWN, np.int8)
+            nothing = OccupancyGrid(self._grid_options.resolution_m, np.zeros(2), unknown)
+            self._outputs.grid(stamp_s, nothing, 0.0)
+            self._has_grid = False
 
     def _add_submap(self, number: int, points: Floats, colours: Bytes) -> None:
         self._grid.add(number, points)
@@ -137,6 +146,12 @@ class Ros2Publisher:
         counts = health.pop("source")
         self._outputs.health(stamp_s, health | counts)
 
+    def _publish_objects(self, stamp_s: float, run: LiveRun) -> None:
+        found = run.objects()
+        if found is not None and found is not self._told:
+            self._told = found
+            self._outputs.objects(stamp_s, found)
+
     def _publish_grid(self, stamp_s: float, run: LiveRun) -> None:
         """Let a thread make the grid, unless it still makes the one before."""
         if self._making is not None:
@@ -153,6 +168,7 @@ class Ros2Publisher:
         found = self._grid.grid(poses)
         if found is not None:
             self._outputs.grid(stamp_s, *found)
+            self._has_grid = True
         cloud = self._cloud.cloud(poses)
         if cloud is not None:
             self._outputs.cloud(stamp_s, *cloud)

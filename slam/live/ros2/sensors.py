@@ -160,11 +160,12 @@ class Ros2Sensors:
 
     def T_odom_base(self, time_s: float) -> Array | None:
         """The base's pose (4, 4) by odometry at an image's time; None if that is not covered."""
-        stamps = self._recent[:, 0]
+        recent = self._recent  # the thread that receives puts another one in its place
+        stamps = recent[:, 0]
         if len(stamps) < 2 or not stamps[0] <= time_s <= stamps[-1] + MAX_BEYOND_S:
             return None
         near = max(int(np.searchsorted(stamps, time_s)), 1)
-        rows = self._recent[min(near, len(stamps) - 1) - 1 :][:2]
+        rows = recent[min(near, len(stamps) - 1) - 1 :][:2]
         return np.asarray(interpolated(rows, np.array([time_s]))[0])
 
 

@@ -18,6 +18,7 @@ logger = logging.getLogger(__name__)
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
 SAVE_S = 60.0
 """Longest time that the map's process may take to save the map."""
+ENDED = "the run has ended"
 
 
 class ServedRun(Protocol):
@@ -53,6 +54,7 @@ class Ros2Services:
         self._reset = node.service(f"{prefix}/reset", TRIGGER)
         self._localise = node.service(f"{prefix}/localise_only", SET_BOOL)
         self._saving: list[_Saving] = []
+        self._later: list[_Saving] = []  # called while a map is being saved, which may lack frames
         self._resetting: list[Request] = []
 
     def serve(self, run: ServedRun) -> bool:
@@ -63,25 +65,40 @@ class Ros2Services:
             self._begin_saving(run, request)
         if self._saving:
             self._answer_saved(run)
+        if self._later and not self._saving:
+            run.save_map(self._later[0].path)
+            self._saving, self._later = self._later, []
         self._resetting += self._reset.take()
         self.reset_asked = bool(self._resetting)
         return self.reset_asked
 
     def begin(self, before: Path | None, now: Path | None) -> None:
         """Another run has begun, in a folder of its own; answers who asked for it."""
-        for saving in self._saving:
+        for saving in [*self._saving, *self._later]:
             _reply(saving.request, False, "the run ended before its map was saved")
         for request in self._resetting:
             _reply(request, True, f"the run until now is in {before}, the new one in {now}")
-        self._saving, self._resetting, self.reset_asked = [], [], False
+        self._saving, self._later = [], []
+        self._resetting, self.reset_asked = [], False
+
+    def end(self, run: Path | None) -> None:
+        """The run has ended, and no other begins; answers who still waits."""
+        saved = None if run is None else run.absolute() / MAP
+        is_saved = saved is not None and saved.exists()
+        for saving in [*self._saving, *self._later]:
+            _reply(saving.request, is_saved, str(saved) if is_saved else ENDED)
+        for request in [*self._resetting, *self._save.take(), *self._reset.take()]:
+            _reply(request, False, ENDED)
+        for request in self._localise.take():
+            _reply(request, False, ENDED, kind=SET_BOOL)
+        self._saving, self._later, self._resetting = [], [], []
 
     def _begin_saving(self, run: ServedRun, request: Request) -> None:
         if run.out is None:
             _reply(request, False, "the run has no folder")
             return
         path = run.out.absolute() / MAP
-        run.save_map(path)
-        self._saving.append(_Saving(request, path, time.monotonic() + SAVE_S))
+        self._later.append(_Saving(request, path, time.monotonic() + SAVE_S))
 
     def _answer_saved(self, run: ServedRun) -> None:
         answers = {saved.path: saved for saved in run.saved_maps()}

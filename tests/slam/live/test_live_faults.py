@@ -28,6 +28,7 @@ from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.live.recorder import HEALTH_S
 from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
+from bmask_slam.run_folder.reader import Run
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
@@ -127,6 +128,19 @@ def test_a_killed_segmenter_loses_only_masks(tmp_path) -> None:
     assert len(read_tum(tmp_path / "run" / "trajectory.txt")) == len(FRAMES)
     assert len((tmp_path / "run" / "labels.csv").read_text().splitlines()) > 20
     assert not running(pids)
+
+
+def test_the_last_objects_and_keyframes_are_those_that_are_saved(tmp_path) -> None:
+    semantics = {"semantics": CONFIG.semantics.__class__(segmenter=label_image(tmp_path))}
+    config = CONFIG.__class__(**{**vars(CONFIG), **semantics})
+    with LiveSlam(CAMERA, config, LiveOptions(tmp_path / "run")) as slam:
+        track_frames(slam, FRAMES)
+    run, found, poses = Run(tmp_path / "run"), slam.objects(), slam.keyframe_poses()
+    assert found is not None
+    assert [one.id for one in found.objects] == [one.id for one in run.objects]
+    assert list(poses) == run.keyframes.ids.tolist()
+    saved = run.keyframes.poses_world_camera
+    np.testing.assert_allclose(np.array(list(poses.values())), saved, atol=1e-6)
 
 
 def test_a_hanging_segmenter_is_restarted(tmp_path, monkeypatch) -> None:

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import pytest
 
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.processes.worker import Failure, Worker
+from bmask_slam.runtime.fork_server import IS_SUPPORTED, server_pid
 
 HERE = f"{__name__}"
 
@@ -154,6 +156,38 @@ def test_a_worker_does_not_import_from_the_current_folder(tmp_path, monkeypatch)
     finally:
         worker.kill()
     assert not (tmp_path / "ran").exists()
+
+
+def test_a_worker_of_an_owner_whose_folder_was_removed(tmp_path, monkeypatch) -> None:
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+    worker = Worker("echo", f"{HERE}:echo", "a")
+    worker.send(1)
+    try:
+        assert answers(worker, 1) == [("a", 1)]
+    finally:
+        worker.kill()
+
+
+@pytest.mark.skipif(not IS_SUPPORTED, reason="needs a server")
+def test_nobody_waits_for_a_worker_that_is_not_there_yet() -> None:
+    Worker("echo", f"{HERE}:echo", "a").kill()  # now there is a server
+    server = server_pid()
+    assert server is not None
+    os.kill(server, signal.SIGSTOP)
+    try:
+        worker = Worker("echo", f"{HERE}:echo", "a")
+        found: list[float] = []
+        asking = threading.Thread(target=lambda: found.append(worker.processor_s), daemon=True)
+        asking.start()
+        asking.join(30)
+        assert found == [0.0]
+    finally:
+        os.kill(server, signal.SIGCONT)
+    assert worker.pid
+    worker.kill()
 
 
 def test_ctrl_c_in_the_terminal_does_not_reach_a_worker() -> None:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import pickle
+import resource
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -36,7 +41,14 @@ from bmask_slam.live.messages import (
 )
 from bmask_slam.live.network import server as server_module
 from bmask_slam.live.network.carrying import PIECE, CarriedFiles, FilePiece, Outbox, store
-from bmask_slam.live.network.connection import Connection, admit, introduce, make_token, read_token
+from bmask_slam.live.network.connection import (
+    Connection,
+    Keys,
+    admit,
+    introduce,
+    make_token,
+    read_token,
+)
 from bmask_slam.live.network.server import WorkstationServer
 from bmask_slam.live.network.workstation import Workstation
 from bmask_slam.live.processes import map_return, map_worker, supervision
@@ -146,6 +158,17 @@ def test_who_is_silent_is_dropped(cut, monkeypatch) -> None:
         assert end.recv(1) == b""
 
 
+def test_who_is_silent_keeps_nobody_out(cut) -> None:
+    """Strangers that hold all places, and come again."""
+    address = "127.0.0.1", cut._to
+    with ExitStack() as strangers:
+        for _ in range(3 * server_module.MAX_HANDSHAKES):
+            strangers.enter_context(socket.create_connection(address))
+        with socket.create_connection(address) as end:
+            end.settimeout(60)
+            assert introduce(end, TOKEN).sending
+
+
 def test_another_version_is_said() -> None:
     one, two = both_ends()
     two.sendall(b"bmask-slam 8".ljust(64, b"\0"))
@@ -206,6 +229,67 @@ def test_the_command_makes_a_token_and_listens(tmp_path, monkeypatch, capsys) ->
     assert main(["live", str(tmp_path), "--workstation", "a:b", "--token-file", str(path)]) == 1
 
 
+def test_a_name_that_is_none_of_a_host_is_said(tmp_path: Path) -> None:
+    for host in ("a..b", "a" * 70):
+        with pytest.raises(InputError, match="cannot be reached"):
+            Workstation(host, 1, TOKEN).worker("map", ())
+        with pytest.raises(InputError, match=host):
+            WorkstationServer(host, 0, TOKEN)
+
+
+def test_a_workstation_outlives_a_lack_of_descriptors(caplog) -> None:
+    server = WorkstationServer("127.0.0.1", 0, TOKEN)
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    thread = threading.Thread(target=server.serve)
+    with closing(server), socket.socket() as end:
+        end.connect(("127.0.0.1", server.port))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
+        try:
+            thread.start()
+            until(lambda: "nobody can be admitted" in caplog.text or not thread.is_alive())
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+        assert thread.is_alive()
+        keys = introduce(end, TOKEN)
+        assert keys.sending != keys.receiving
+    thread.join(60)
+    assert not thread.is_alive()
+
+
+def test_a_process_without_its_keys_reads_nothing() -> None:
+    one, two = both_ends()
+    code = f"from bmask_slam.live.network.server import work; work({two.fileno()})"
+    child = subprocess.Popen(
+        [sys.executable, "-c", code], pass_fds=[two.fileno()], stdin=subprocess.DEVNULL
+    )
+    two.close()
+    with one:
+        Connection(one, Keys(b"", b"")).send((pickle.dumps(("map", (), None)), []))
+        assert child.wait(60) == 0
+        with suppress(ConnectionResetError):  # it has left everything unread
+            assert one.recv(1) == b""  # else it would have answered with a failure
+
+
+def test_connections_that_have_ended_keep_no_descriptor(cut) -> None:
+    there = workstation(cut)
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(3):
+        end = there.worker("nothing", ())
+        until(lambda end=end: not end.is_running)
+        assert end.receive()
+        end.kill()
+    cut.cut()
+    until(lambda: all(one.fileno() < 0 for one in there.traffic.connections))
+    sent = there.traffic.sent_bytes
+    cut.away = False
+    there.worker("nothing", ()).kill()
+    assert len(there.traffic.connections) == 1
+    assert there.traffic.sent_bytes >= sent > 0 < there.traffic.received_bytes
+    for end in cut._ends:
+        end.close()
+    until(lambda: len(os.listdir("/proc/self/fd")) <= before)
+
+
 # --- files ---------------------------------------------------------------------------------------
 
 
@@ -243,6 +327,21 @@ def test_files_of_the_map_are_carried_to_the_robots_paths(tmp_path: Path) -> Non
     assert robot.read_bytes() == data
     lost = replace(sent[1], path=tmp_path / "gone" / "state")
     assert store(lost, lambda error: error.errno) == 2
+
+
+def test_a_file_that_lacks_a_piece_gets_no_name(tmp_path: Path) -> None:
+    """The disk was full for a while."""
+    path, one = tmp_path / "state", np.ones(1000, np.uint8)
+    pieces = [FilePiece(path, 1000 * k, one, "saved" if k == 2 else None) for k in range(3)]
+    assert store(pieces[0], str) is None
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        assert store(pieces[1], str) is None
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "No such file" in store(pieces[2], str)
+    assert not list(tmp_path.iterdir())
 
 
 # --- the map's process, with stand-ins -----------------------------------------------------------

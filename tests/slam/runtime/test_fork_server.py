@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,15 +16,15 @@ from pathlib import Path
 import pytest
 from faults import LONG_S, running, wait_until
 
-from bmask_slam.runtime import fork_server
+from bmask_slam.runtime import forked_process
 from bmask_slam.runtime.fork_server import (
     IS_SUPPORTED,
-    ForkedProcess,
     ForkServer,
     Start,
     server_pid,
     start_forked,
 )
+from bmask_slam.runtime.forked_process import ForkedProcess
 
 pytestmark = pytest.mark.skipif(not IS_SUPPORTED, reason="needs Linux")
 
@@ -137,7 +140,7 @@ def test_a_process_that_was_asked_of_a_dead_server_has_ended(
 def test_a_server_that_hangs_is_killed_for_a_process_that_is_to_end(
     server: ForkServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fork_server, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(forked_process, "PATIENCE_S", 0.1)
     os.kill(server.pid, signal.SIGSTOP)
     process, pipe = started(server, "waits", tmp_path)
     assert process.poll() is None
@@ -145,6 +148,111 @@ def test_a_server_that_hangs_is_killed_for_a_process_that_is_to_end(
     assert process.wait(LONG_S) == -signal.SIGKILL
     assert not server.is_running
     os.close(pipe)
+
+
+def test_a_server_that_hangs_later_is_killed_too(
+    server: ForkServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(forked_process, "PATIENCE_S", 0.1)
+    process, pipe = started(server, "waits", tmp_path)
+    assert os.read(pipe, 5) == b"begun"
+    os.kill(server.pid, signal.SIGSTOP)
+    process.kill()
+    assert process.wait(LONG_S) == -signal.SIGKILL
+    assert not server.is_running
+    os.close(pipe)
+
+
+@pytest.fixture
+def orphans() -> Iterator[None]:
+    """Orphans become children of this process, which does not wait for them."""
+    become_reaper = ctypes.CDLL(None).prctl
+    assert become_reaper(36, 1, 0, 0, 0) == 0
+    yield
+    become_reaper(36, 0, 0, 0, 0)
+
+
+@pytest.mark.usefixtures("orphans")
+def test_an_orphan_that_nobody_waits_for_has_ended(server: ForkServer, tmp_path: Path) -> None:
+    """As in a container whose first process waits for no orphans."""
+    process, pipe = started(server, "waits", tmp_path)
+    assert os.read(pipe, 5) == b"begun"
+    os.kill(server.pid, signal.SIGKILL)
+    wait_until(lambda: not server.is_running)
+    process.kill()
+    assert process.wait(LONG_S) == -signal.SIGKILL
+    assert os.waitpid(process.pid, 0)[1] == signal.SIGKILL
+    os.close(pipe)
+
+
+def test_a_server_that_hangs_stops_nobody_who_asks(server: ForkServer, tmp_path: Path) -> None:
+    """Also where the environment is larger than what a socket holds."""
+    os.kill(server.pid, signal.SIGSTOP)
+    large = {f"BMASK_SLAM_TEST_{k}": "x" * 10_000 for k in range(200)}
+    start = Start("os:getcwd", "os", os.environ | large, sys.path, str(tmp_path))
+    found: list[ForkedProcess] = []
+    asking = threading.Thread(target=lambda: found.append(server.start(start, [])), daemon=True)
+    asking.start()
+    asking.join(30)
+    assert found
+    assert not found[0].has_begun
+    os.kill(server.pid, signal.SIGCONT)
+    assert found[0].wait(LONG_S) == 0
+    assert found[0].has_begun
+
+
+def test_an_owner_without_output(tmp_path: Path) -> None:
+    """Its files have the numbers of the standard streams, and are not taken for them."""
+    script = (
+        "import os, sys; from bmask_slam.runtime.fork_server import ForkServer, Start\n"
+        "start = Start('library:warn', 'os', dict(os.environ), sys.path, '/')\n"
+        "files = [os.open(os.devnull, os.O_RDONLY) for _ in range(2)]\n"
+        "server = ForkServer(os.environ)\n"
+        "[os.close(file) for file in files]\n"
+        "process = server.start(start, [])\n"
+        "found = process.wait(300), process.pid\n"
+        "open(sys.argv[1], 'w').write(str(found))"
+    )
+    (tmp_path / "library.py").write_text("import os\ndef warn(): os.write(2, b'a warning')")
+    told = tmp_path / "told"
+    words = ["/bin/sh", "-c", 'exec "$@" >&- 2>&-', "sh", sys.executable, "-c", script, str(told)]
+    paths = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": paths}
+    subprocess.run(words, check=True, timeout=LONG_S, env=environment)
+    code, pid = told.read_text().strip("()").split(", ")
+    assert code == "0"
+    assert 0 < int(pid) <= int(Path("/proc/sys/kernel/pid_max").read_text())
+
+
+def test_an_owner_with_more_than_a_thousand_files(server: ForkServer, tmp_path: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    opened = [os.open(os.devnull, os.O_RDONLY)]
+    try:
+        if hard != resource.RLIM_INFINITY and hard < 1100:
+            pytest.skip("so many files are not allowed")
+        while opened[-1] < 1030:
+            opened.append(os.dup(opened[0]))
+        process, pipe = started(server, "exits_with_3", tmp_path)
+        assert process.wait(LONG_S) == 3
+        os.close(pipe)
+    finally:
+        for descriptor in opened:
+            os.close(descriptor)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_a_replaced_server_leaves_no_files(tmp_path: Path) -> None:
+    counts = []
+    for _ in range(3):
+        process = start_forked(start_of("exits_with_3", tmp_path), [0])
+        assert process.wait(LONG_S) == 3
+        del process
+        counts.append(len(os.listdir("/proc/self/fd")))
+        pid = server_pid() or 0
+        os.kill(pid, signal.SIGKILL)
+        wait_until(lambda pid=pid: not running([pid]))
+    assert counts[1] == counts[2]
 
 
 def test_a_killed_server_is_replaced(tmp_path: Path) -> None:
@@ -170,3 +278,31 @@ def test_the_server_ends_with_its_owner() -> None:
     owner.kill()
     owner.wait()
     wait_until(lambda: not Path(f"/proc/{pid}").exists())
+
+
+def test_the_server_ends_with_an_owner_that_has_forked() -> None:
+    """A process that a user's program forks by itself does not keep the server."""
+    script = (
+        "import os, sys, time\n"
+        "from bmask_slam.runtime.fork_server import Start, server_pid, start_forked\n"
+        "start = Start('os:getcwd', 'os', dict(os.environ), sys.path, '/')\n"
+        "start_forked(start, []).wait(300)\n"
+        "first, child = server_pid(), os.fork()\n"
+        "if child == 0:\n"
+        "    assert server_pid() is None\n"
+        "    assert start_forked(start, []).wait(300) == 0\n"
+        "    print(first, os.getpid(), flush=True)\n"
+        "time.sleep(600)"
+    )
+    owner = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert owner.stdout is not None
+    with owner.stdout as said:
+        server, child = map(int, said.readline().split())
+    assert running([server])
+    owner.kill()
+    owner.wait()
+    try:
+        wait_until(lambda: not running([server]))
+        assert running([child])
+    finally:
+        os.kill(child, signal.SIGKILL)

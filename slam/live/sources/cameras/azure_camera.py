@@ -49,6 +49,7 @@ class AzureSource(CameraSource):
             camera_fps=k4a.FPS.FPS_30,
             synchronized_images_only=True,
         )
+        self._failures = (k4a.K4AException,)
         self._device = k4a.PyK4A(config, device_id=device)
         try:
             self._device.start()

@@ -51,19 +51,20 @@ class CameraSource(MeasuredSource, ABC):
         self.groundtruth: Trajectory | None = None
         self.counts = SourceCounts()
         self._silence_s = silence_s
+        self._failures: tuple[type[Exception], ...] = (RuntimeError,)  # as of bindings of C++
         self._closed = threading.Event()
 
     def frames(self) -> Iterator[Frame]:
         """Each frame as soon as it is captured; the device is released at the end.
 
         Raises:
-            InputError: none came for ``silence_s``.
+            InputError: none came for ``silence_s``, or the device's library failed.
         """
         clock, gaps = StreamClock(self.counts), GapMeter(self.counts)
         index, heard_s = 0, time.monotonic()
         try:
             while not self._closed.is_set():
-                images = self._capture_images()
+                images = self._captured()
                 if images is None:
                     self._check_silence(heard_s)
                     self._closed.wait(RETRY_S)
@@ -80,6 +81,15 @@ class CameraSource(MeasuredSource, ABC):
     def close(self) -> None:
         """End ``frames`` soon; may be called from any thread."""
         self._closed.set()
+
+    def _captured(self) -> CameraImages | None:
+        try:
+            return self._capture_images()
+        except self._failures as error:
+            reason = str(error) or type(error).__name__
+            raise InputError(
+                f"{self.name}: gives no more frames ({reason}); is the camera still plugged in?"
+            ) from error
 
     @abstractmethod
     def _capture_images(self) -> CameraImages | None:

@@ -12,6 +12,7 @@ pytest.importorskip("rosbags")
 
 from test_ros2_sensors import StandIn
 
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, transform
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud, MapObjects
@@ -186,3 +187,42 @@ def test_maps_are_published_when_they_are_due(monkeypatch) -> None:
     assert len(node.topics["/bmask_slam/path"]) == 8
     publish.finish(run)
     assert len(node.topics["/bmask_slam/path"]) == len(node.topics["/bmask_slam/landmarks"]) == 9
+    for topic in ("map", "cloud"):
+        name = f"/bmask_slam/{topic}"
+        assert len(node.topics[name]) == counts[name] + 1
+
+
+def test_what_is_published_last_is_of_the_map_at_the_end() -> None:
+    node, run = StandIn(), Run()
+    publish = Ros2Publisher(node, Ros2Frames(), Robot(T_MAP_WORLD, True))
+    publish(FrameResult(0, 5.0, TrackingStatus.OK, np.eye(4), 0), run)
+    points = room(2.02)
+    run.listeners[0](4, points, np.zeros((len(points), 3), np.uint8))
+    moved, T = some_objects(), make_pose(np.eye(3), np.array([0.5, 0.0, 0.0]))
+    run.objects = lambda: moved  # type: ignore[method-assign]
+    run.keyframe_poses = lambda: {4: T}  # type: ignore[method-assign]
+    publish.finish(run)
+    assert len(node.topics["/bmask_slam/objects"]) == 2
+    cloud = node.topics["/bmask_slam/cloud"][-1]
+    xyz = np.frombuffer(cloud.data.tobytes(), "<f4").reshape(-1, 4)[:, :3]
+    expected = transform(T_MAP_WORLD @ T, points.astype(float))
+    assert np.allclose(xyz.min(axis=0), expected.min(axis=0), atol=0.04)
+    assert node.topics["/bmask_slam/map"][-1].info.width > 20
+
+
+def test_a_segment_that_is_joined_later_is_in_the_grid() -> None:
+    grid = LiveGrid(T_MAP_WORLD, GridOptions(floor_m=0.0))
+    grid.add(4, room(2.02))
+    grid.add(9, room(2.52))
+    assert grid.grid({9: np.eye(4)}) is not None  # 4 is of another segment
+    far = make_pose(np.eye(3), np.array([5.0, 0.0, 0.0]))
+    joined, _ = grid.grid({4: far, 9: np.eye(4)})
+    alone, _ = grid.grid({9: np.eye(4)})
+    assert joined.cells.size > alone.cells.size
+
+
+@pytest.mark.parametrize("name", ["grid_resolution_m", "cloud_voxel_m"])
+def test_an_edge_of_nothing_is_refused(name: str) -> None:
+    for edge_m in (0.0, -1.0, float("inf"), float("nan")):
+        with pytest.raises(InputError, match=name):
+            Ros2Frames(**{name: edge_m})

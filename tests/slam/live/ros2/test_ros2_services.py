@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("cyclonedds")
 
 from test_ros2 import LOOPBACK
-from test_ros2_maps import T_MAP_WORLD, Run, some_objects
+from test_ros2_maps import T_MAP_WORLD, Run, room, some_objects
 from test_ros2_sensors import StandIn
 
 from bmask_slam.cli import main
@@ -28,7 +28,7 @@ from bmask_slam.live.ros2.dds import CALL_BYTES, HEADER_BYTES, DdsService, carri
 from bmask_slam.live.ros2.grid import LiveCloud
 from bmask_slam.live.ros2.outputs import Robot, Ros2Frames
 from bmask_slam.live.ros2.publisher import Ros2Publisher
-from bmask_slam.live.ros2.services import SAVE_S, Ros2Services
+from bmask_slam.live.ros2.services import ENDED, SAVE_S, Ros2Services
 from bmask_slam.live.ros2.transport import encoded, typestore
 from bmask_slam.run_folder.map_file import read_map
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
@@ -137,6 +137,45 @@ def test_a_map_is_saved_or_it_is_said_why_not(monkeypatch) -> None:
     assert calls[4].answers == [(False, "the run ended before its map was saved")]
 
 
+def test_many_calls_save_few_maps() -> None:
+    """The map's process is kept busy by nobody; each answer is of a map saved after its call."""
+    ros, run, asked = node(), Served(), []  # type: ignore[var-annotated]
+    run.save_map = asked.append
+    services, calls = Ros2Services(ros, "/x"), [Call(TRIGGER(0)) for _ in range(101)]
+    ros.calls["save_map"] += calls[:1]
+    services.serve(run)
+    for call in calls[1:]:
+        ros.calls["save_map"] += [call]
+        services.serve(run)
+    assert asked == [Path("/run/map")]
+    run.saved = (MapSaved(asked[0]),)
+    services.serve(run)
+    assert [len(call.answers) for call in calls] == [1] + 100 * [0]
+    assert len(asked) == 2
+    run.saved = (MapSaved(asked[1]),)
+    services.serve(run)
+    assert {tuple(call.answers) for call in calls} == {((True, "/run/map"),)}
+    assert len(asked) == 2
+
+
+def test_who_waits_at_the_end_is_answered(tmp_path: Path) -> None:
+    for folder, answer in ((tmp_path, (True, str(tmp_path / "map"))), (None, (False, ENDED))):
+        (tmp_path / "map").touch()
+        ros, run = node(), Served(out=tmp_path)
+        services = Ros2Services(ros, "/x")
+        save, reset, late = (Call(TRIGGER(0)) for _ in range(3))
+        ros.calls["save_map"] += [save]
+        services.serve(run)
+        ros.calls["reset"] += [reset]
+        services.serve(run)
+        ros.calls["save_map"] += [late]
+        only = Call(SET_BOOL(True))
+        ros.calls["localise_only"] += [only]
+        services.end(folder)
+        assert save.answers == [answer]
+        assert reset.answers == late.answers == only.answers == [(False, ENDED)]
+
+
 def test_a_call_has_its_number_before_its_fields() -> None:
     """As rmw_cyclonedds' cdds_request_header_t: uint64 guid, int64 sequence number."""
     name, sent = "std_srvs/srv/SetBool", []
@@ -210,11 +249,13 @@ def test_another_run_begins_with_an_empty_map() -> None:
     second.objects = lambda: None  # type: ignore[assignment, return-value, method-assign]
     result = FrameResult(0, 5.0, TrackingStatus.OK, np.eye(4), 0)
     publish(result, first)
-    first.listeners[0](4, np.ones((5, 3), np.float32), np.zeros((5, 3), np.uint8))
+    first.listeners[0](4, room(2.02), np.zeros((len(room(2.02)), 3), np.uint8))
     assert publish._making is not None
     publish._making.result(10)
     publish._make_grid(5.0, {4: make_pose(np.eye(3), np.zeros(3))})
     assert ros.topics["/bmask_slam/cloud"][-1].width >= 1
+    assert ros.topics["/bmask_slam/map"][-1].info.width > 20
     publish(result, second)
     assert ros.topics["/bmask_slam/cloud"][-1].width == 0
+    assert ros.topics["/bmask_slam/map"][-1].data.tolist() == [-1]
     assert [len(m.markers) for m in ros.topics["/bmask_slam/object_markers"]] == [3, 1]

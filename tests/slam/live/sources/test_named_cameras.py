@@ -56,7 +56,7 @@ class FakeOak:
                 fake.links.append((self.name, other.name))
 
             def createOutputQueue(self, maxSize: int, blocking: bool) -> Any:
-                return SimpleNamespace(tryGet=lambda: groups.pop(0) if groups else None)
+                return SimpleNamespace(tryGet=fake.next_group)
 
         class Node:
             def __init__(self, kind: str) -> None:
@@ -106,6 +106,12 @@ class FakeOak:
             ImgResizeMode=SimpleNamespace(CROP="crop"),
             Platform=SimpleNamespace(RVC2="RVC2", RVC4="RVC4"),
         )
+
+    def next_group(self) -> Any:
+        group = self.groups.pop(0) if self.groups else None
+        if group == "unplugged":
+            raise RuntimeError("X_LINK_ERROR")
+        return group
 
 
 def oak_group(k: int) -> dict[str, Any]:
@@ -191,7 +197,10 @@ def fake_pyk4a(captures: list, is_there: bool = True) -> tuple[ModuleType, dict[
 
         def get_capture(self, timeout: int) -> Any:
             if captures:
-                return captures.pop(0)
+                capture = captures.pop(0)
+                if capture == "unplugged":
+                    raise K4AException
+                return capture
             time.sleep(timeout / 1000)
             raise K4ATimeoutException
 
@@ -244,6 +253,17 @@ def test_a_missing_azure_is_refused(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "pyk4a", fake_pyk4a([], is_there=False)[0])
     with pytest.raises(InputError, match=r"azure-2: cannot start \(K4AException\)"):
         AzureSource(2)
+
+
+def test_a_camera_that_is_unplugged_is_said(monkeypatch) -> None:
+    oak, (module, asked) = FakeOak([oak_group(0), "unplugged"]), fake_pyk4a(["unplugged"])
+    monkeypatch.setitem(sys.modules, "depthai", oak.module)
+    monkeypatch.setitem(sys.modules, "pyk4a", module)
+    with pytest.raises(InputError, match=r"oak: gives no more frames \(X_LINK_ERROR\)"):
+        list(OakSource().frames())
+    with pytest.raises(InputError, match=r"azure-0: gives no more frames \(K4AException\)"):
+        list(AzureSource(0).frames())
+    assert (oak.stopped, asked["stopped"]) == (1, 1)
 
 
 def test_azures_images_are_undistorted_by_its_rational_model() -> None:
