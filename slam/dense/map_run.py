@@ -7,6 +7,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,9 +23,11 @@ from bmask_slam.dense.saved_map import MappedRun, open_run, with_right_images
 from bmask_slam.dense.surface import FusedMap
 from bmask_slam.graph.arrays import Image, Mask
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.growing_table import lock_file
 from bmask_slam.graph.whole_file import remove
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.mapping.inverse_depth.dense_mapper import WINDOW
+from bmask_slam.run_folder.frame_file import FRAMES as FRAME_TABLE
 from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.semantics.instances.instances import Instance
@@ -69,8 +72,18 @@ def map_run(options: MapOptions, progress: Progress = lambda done, total: None) 
     products = write_products(fused, progress)
     summary = MapSummary(fused.folder.path, counts, products, time.perf_counter() - started_s)
     write_summary(fused.folder, summary)
-    remove(fused.folder.path / FRAMES)  # of a live run that was killed
+    remove_stored_frames(options.run, fused.folder.path)
     return summary
+
+
+def remove_stored_frames(run: Path, dense: Path) -> None:
+    """Remove the frames that a killed live run had stored, unless a run is being written there."""
+    try:
+        with suppress(FileNotFoundError), (run / FRAME_TABLE).open("rb") as file:
+            lock_file(file, run)
+    except InputError:
+        return
+    remove(dense / FRAMES)
 
 
 def _fused(options: MapOptions, progress: Progress) -> tuple[FusedMap, FusionCounts]:

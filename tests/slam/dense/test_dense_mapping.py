@@ -19,7 +19,7 @@ from true_run import FRAMES, make_run
 from bmask_slam.cli import main
 from bmask_slam.dense.folder import LABEL_FILE, DenseFolder
 from bmask_slam.dense.keyframe_input import load_keyframe
-from bmask_slam.dense.map_run import map_run
+from bmask_slam.dense.map_run import map_run, remove_stored_frames
 from bmask_slam.dense.options import MapOptions
 from bmask_slam.dense.products import KeyframeEvidence
 from bmask_slam.dense.saved_map import MappedRun, open_run
@@ -27,6 +27,7 @@ from bmask_slam.dense.surface import FusedMap, make_surface
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested, read_arrays, write_arrays
+from bmask_slam.graph.files.growing_table import lock_file
 from bmask_slam.graph.files.ply import read_ply, write_ply
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.trajectory import Trajectory, write_tum
@@ -192,6 +193,19 @@ def test_what_a_later_map_does_not_make_is_not_left_of_an_older_surface(
     names = {path.name for path in (run / "dense").iterdir()}
     assert not names & of_surface
     assert names >= {"cloud.ply", "semantic.ply", "view_first_semantic.png", "mesh.blend"}
+
+
+def test_frames_of_a_run_that_is_being_written_stay(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    stored = run / "dense" / "frames"
+    stored.mkdir(parents=True)
+    (run / "frames.csv").touch()
+    with (run / "frames.csv").open("rb") as file:
+        lock_file(file, run)
+        remove_stored_frames(run, run / "dense")
+        assert stored.is_dir()
+    remove_stored_frames(run, run / "dense")
+    assert not stored.exists()
 
 
 def test_excluded_classes_are_missing_or_in_another_cloud(mapped: Path, tmp_path: Path) -> None:
