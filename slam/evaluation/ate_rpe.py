@@ -90,7 +90,7 @@ def evaluate_trajectory(
     """
     matched, truth = associate(estimate, reference, max_time_difference_s)
     if not len(estimate):
-        raise InputError("no frame has a pose, so there is nothing to compare; track it first")
+        raise InputError("the trajectory has no pose, so there is nothing to compare")
     if len(matched) < MIN_POSES:
         raise InputError(
             f"{len(matched)} of {len(estimate)} poses have a reference pose within "

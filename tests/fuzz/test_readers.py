@@ -52,6 +52,7 @@ ELSEWHERE = {
     "slam/doctor/cameras.py": "/sys",
     "slam/doctor/machine.py": "/proc, /sys",
     "slam/doctor/packages.py": "what its own process prints",
+    "slam/runtime/forked_process.py": "/proc",
     "slam/runtime/machine.py": "/proc",
     "slam/runtime/memory.py": "/proc",
     "slam/live/processes/worker.py": "/proc",
