@@ -169,7 +169,7 @@ class Mapper:
         self.change_graph()
 
     def join(self, segment: int, tracked: Tracked, recognised: Tracked) -> Tracked:
-        """Move a segment into another one in which a frame of it was recognised; returns that."""
+        """Move a segment to where its frame was recognised; returns that as tracked there."""
         inliers = len(recognised.landmark_ids)
         self.events.joined(segment, self.world.segment_of(recognised.landmark_ids), inliers)
         joined = join_segment(self.world, segment, tracked, recognised)
