@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from bmask_slam.graph.errors import InputError, did_you_mean
@@ -23,3 +24,14 @@ def data_path(*parts: str) -> Path:
         near = did_you_mean(path.stem, available)
         raise InputError(f"{path}: no such file; there are: {listed}{near}")
     return path
+
+
+def given_or_shipped(name: str | Path, kind: str) -> Path:
+    """A YAML file from its path, or from the bare name of one in ``data/``'s folder ``kind``.
+
+    Raises:
+        InputError: a bare name that is neither.
+    """
+    if re.fullmatch(r"[\w-]+", str(name)) and not Path(name).is_file():
+        return data_path(kind, f"{name}.yaml")
+    return Path(name)

@@ -30,7 +30,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
         InputError: ``path`` is a folder.
     """
-    _refuse_folder(path)
+    if path.is_dir() and not path.is_symlink():
+        raise _is_folder(path)
     temporary = _temporary(path)
     os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
@@ -91,16 +92,16 @@ def remove_partial(folder: Path) -> None:
 def check_target(path: Path) -> None:
     """Raise InputError if a file cannot be made there, before the work of which it is the result.
 
-    ``path`` is a folder, or there is no folder for it.
+    ``path`` is a folder, or a link to one, or there is no folder for it.
     """
-    _refuse_folder(path)
     if not path.parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} is not there; make it first")
+    if path.is_dir():
+        raise _is_folder(path)
 
 
-def _refuse_folder(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        raise InputError(f"{path}: is a folder; give the name of a file to write")
+def _is_folder(path: Path) -> InputError:
+    return InputError(f"{path}: is a folder; give the name of a file to write")
 
 
 def _temporary(path: Path) -> Path:

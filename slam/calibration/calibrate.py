@@ -30,6 +30,7 @@ from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.metrics import align
 from bmask_slam.graph.smoother.storage import read_graph
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, nearest_indices, read_tum
+from bmask_slam.graph.whole_file import check_target
 from bmask_slam.run_folder.map_file import SavedRun, read_run
 from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.run_folder.reader import Run
@@ -129,8 +130,7 @@ def check_options(options: CalibrateOptions) -> Path:
     out = options.out or run.path / "camera.yaml"
     if out.exists() and not (options.overwrite or _is_of_run(out, options)):
         raise InputError(f"{out}: is there already; choose another --out or add --overwrite")
-    if not out.parent.is_dir():
-        raise InputError(f"{out}: the folder {out.parent} is not there; make it first")
+    check_target(out)
     for name in options.fixed:
         if not parameters_named(name):
             raise InputError(f"--fix {name}: is no parameter; they are {', '.join(PARAMETERS)}")

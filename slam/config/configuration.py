@@ -10,7 +10,6 @@ import dataclasses
 import difflib
 import json
 import math
-import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from enum import EnumType
@@ -20,7 +19,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.data_files import given_or_shipped
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.yaml_file import format_yaml, parse_yaml, read_yaml
 
@@ -61,9 +60,7 @@ serves for others."""
 
 def find_config(name: str) -> Path:
     """A YAML file from its path, or from the bare name of one in ``data/configs``."""
-    if re.fullmatch(r"[\w-]+", name) and not Path(name).is_file():
-        return data_path("configs", f"{name}.yaml")
-    return Path(name)
+    return given_or_shipped(name, "configs")
 
 
 def resolve(

@@ -18,7 +18,7 @@ from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment, loop_edges
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.whole_file import check_target, whole_file
 
 PICTURE_TYPES = (".png", ".pdf", ".svg")
 
@@ -67,10 +67,7 @@ class View:
 
 def check_picture(path: Path) -> None:
     """Raises InputError if a picture could not be written there, before the work is done."""
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: the folder {path.parent} is not there; make it first")
-    if path.is_dir():
-        raise InputError(f"{path}: a folder; give the name of a file to write")
+    check_target(path)
     if path.suffix.lower() not in PICTURE_TYPES:
         raise InputError(f"{path}: cannot draw {path.suffix!r}; use {', '.join(PICTURE_TYPES)}")
 

@@ -22,6 +22,7 @@ from bmask_slam.graph.pose_graph.optimisation import (
     optimise_pose_graph,
 )
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph
+from bmask_slam.graph.whole_file import check_target
 from bmask_slam.refinement.adjustment_plot import (
     GraphSnapshot,
     View,
@@ -62,7 +63,7 @@ def optimise_file(
             ``read_g2o`` or the solver refuses the file.
     """
     options = options or GraphOptions()
-    _check_output(out)
+    check_target(out)
     if options.plot is not None:
         check_picture(options.plot)
     graph, certificate = read_g2o(file, options.repair), None
@@ -98,7 +99,7 @@ def adjust_file(
     Raises:
         InputError: as ``optimise_file``.
     """
-    _check_output(out)
+    check_target(out)
     if plot is not None:
         check_picture(plot)
     tables, camera = read_landmark_graph(file, repair=repair)
@@ -112,14 +113,6 @@ def adjust_file(
     if plot is not None:
         draw_adjustment(plot, before, after, adjustment)
     return adjustment, after
-
-
-def _check_output(out: Path) -> None:
-    """Raises InputError if the output could not be written, before the work is done."""
-    if not out.parent.is_dir():
-        raise InputError(f"{out}: the folder {out.parent} is not there; make it first")
-    if out.is_dir():
-        raise InputError(f"{out}: a folder; give the name of a file to write")
 
 
 def format_result(result: PoseGraphResult, certificate: Certificate | None = None) -> str:

@@ -17,7 +17,7 @@ from bmask_slam.comparison.experiment.experiment import (
     SequenceSource,
 )
 from bmask_slam.config.configuration import find_config, from_tree, resolve
-from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.data_files import given_or_shipped
 from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.files.yaml_file import read_yaml
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S
@@ -65,9 +65,7 @@ class _Folder:
 
 def find_experiment(name: str | Path) -> Path:
     """An experiment's file from its path, or from the bare name of one in ``data/experiments``."""
-    if re.fullmatch(r"[\w-]+", str(name)) and not Path(name).is_file():
-        return data_path("experiments", f"{name}.yaml")
-    return Path(name)
+    return given_or_shipped(name, "experiments")
 
 
 def read_experiment(name: str | Path) -> Experiment:
