@@ -25,12 +25,11 @@ LIBRARIES = (
     "foxglove",
 )
 CALLS = """
-import contextlib, io, json, sys, time
+import contextlib, io, json, sys
 for name in LIBRARIES:
     sys.modules[name] = None  # as if it were not installed
-started = time.process_time()
 import bmask_slam.cli
-print(json.dumps(time.process_time() - started))
+print(json.dumps(sorted({"numpy", "scipy", "cv2", "gtsam", "faiss", "yaml"} & set(sys.modules))))
 import bmask_slam.comparison.comparing, bmask_slam.live.live_slam
 for words in json.loads(sys.stdin.read()):
     out, err = io.StringIO(), io.StringIO()
@@ -38,7 +37,6 @@ for words in json.loads(sys.stdin.read()):
         status = bmask_slam.cli.main(words)
     print(json.dumps([status, out.getvalue(), err.getvalue()]))
 """
-SECONDS = 1.0
 
 
 @pytest.fixture(scope="module")
@@ -67,12 +65,13 @@ def answers(office: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
         text=True,
         check=True,
     )
-    seconds, *answers = map(json.loads, done.stdout.splitlines())
-    return {"import": seconds, **dict(zip(commands, answers, strict=True))}
+    loaded, *answers = map(json.loads, done.stdout.splitlines())
+    return {"import": loaded, **dict(zip(commands, answers, strict=True))}
 
 
-def test_the_core_is_imported_within_a_second(answers: dict[str, list]) -> None:
-    assert answers["import"] < SECONDS
+def test_the_command_line_loads_no_heavy_library(answers: dict[str, list]) -> None:
+    """So its help comes at once: each command loads what it needs."""
+    assert answers["import"] == []
 
 
 @pytest.mark.parametrize("name", ["run", "evaluate", "optimise", "export", "info"])

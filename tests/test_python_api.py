@@ -22,7 +22,6 @@ from bmask_slam.offline.options import RunOptions
 REFERENCE = (ROOT / "docs/python.md").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
-MAX_IMPORT_S = 0.2
 FRAMES = 14
 MAX_QUICK_START_LINES = 12
 
@@ -64,9 +63,9 @@ def test_another_name_is_an_attribute_error() -> None:
         bmask_slam.Rum  # noqa: B018
 
 
-def test_the_import_is_quick_and_loads_nothing_else() -> None:
-    code = "import time; t = time.process_time(); import bmask_slam; print(time.process_time() - t)"
-    assert min(float(output(code)) for _ in range(3)) < MAX_IMPORT_S
+def test_the_import_loads_nothing_else() -> None:
+    """So it takes milliseconds."""
+    assert loaded_by("import bmask_slam") == set()
     assert loaded_by("import bmask_slam, bmask_slam.graph.geometry") == set()
 
 
