@@ -35,6 +35,7 @@ class RunKeywords(TypedDict, total=False):
     calibrate: str
     dense: bool
     mesh_voxel_m: float
+    parallel: bool
     quiet: bool
 
 

@@ -45,6 +45,7 @@ OPTIONS = (
     "calibrate",
     "dense",
     "mesh_voxel_m",
+    "parallel",
 )
 
 
@@ -72,6 +73,8 @@ def add_run(commands: Commands) -> None:
     parser.add_argument("--reference", type=Path, metavar="F", help="trajectory to compare to")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
     parser.add_argument("--stride", type=int, metavar="N", help="take every N-th frame")
+    text = "map and masks in processes of their own: faster; repeats, with bytes of its own"
+    parser.add_argument("--parallel", action="store_true", default=None, help=text)
     _add_map_arguments(parser)
     add_segmenter_arguments(parser, "light")
     add_topic_arguments(parser)

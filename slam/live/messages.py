@@ -90,6 +90,21 @@ class Started:
     number: int
 
 
+@dataclass(frozen=True)
+class Handled:
+    """From the map: message ``number`` is handled; its answers came before."""
+
+    number: int
+
+
+@dataclass(frozen=True, eq=False)
+class FramesTracked:
+    """To the map: frames since the last keyframe, as in ``NewKeyframe``."""
+
+    visibility: VisibilityCounts
+    history: Entries
+
+
 @dataclass(frozen=True, eq=False)
 class Masks:
     """Masks of a keyframe, from the segmenter to the map; ``segmentation_ms``: time it took."""

@@ -21,13 +21,11 @@ from bmask_slam.live.sources.source import Newest, Source
 from bmask_slam.runtime.progress import make_bar
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.sequences.prefetch import prefetched
+from bmask_slam.sequences.prefetch import FEATURES_AHEAD, prefetched
 from bmask_slam.tracking.results import FrameResult
 
 logger = logging.getLogger(__name__)
 
-AHEAD = 2
-"""Number of frames whose features are extracted ahead of tracking if the source waits."""
 KEPT = 3
 """Largest number of frames that wait for tracking otherwise; one more drops all older ones."""
 STOP_S = 1.0
@@ -82,7 +80,9 @@ def play(
     pairs = _with_features(slam, source)
     with StopRequest() as stop, make_bar(None, options.quiet) as bar:
         chosen = (
-            _newest(slam, pairs, options, stop) if options.realtime else prefetched(pairs, AHEAD)
+            _newest(slam, pairs, options, stop)
+            if options.realtime
+            else prefetched(pairs, FEATURES_AHEAD)
         )
         for pair in chosen:
             if service is not None and service.serve(slam):

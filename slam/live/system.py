@@ -83,6 +83,8 @@ class LiveSystem(SlamSystem):
         mask_listeners: called with the masks of each keyframe as they arrive.
     """
 
+    mapper_type: type[RemoteMapper] = RemoteMapper
+
     def __init__(
         self,
         camera: Camera,
@@ -99,7 +101,7 @@ class LiveSystem(SlamSystem):
         self.label_names = (segmenter or NoSegmenter).labels.names
         self.mask_listeners: list[Callable[[Masks], None]] = []
         with ExitStack() as undo:
-            self.remote = RemoteMapper(camera, config, self.label_names, place)
+            self.remote = self.mapper_type(camera, config, self.label_names, place)
             undo.callback(self.remote.close)
             super().__init__(camera, config, back_end=self.remote)
             self.remote.wait_until_ready(RestartPolicy().start_s)
@@ -187,8 +189,7 @@ class LiveSystem(SlamSystem):
             tracker.reset(0)
             return
         parent = self.remote.world.keyframes[parent_id]
-        T_now = parent.T_world_camera @ T_parent_reference
-        tracker.follow_map(T_before, T_now)
+        tracker.follow_map(T_before, parent.T_world_camera @ T_parent_reference)
         tracker.refer_to(parent)
         tracker.segment = parent.segment
 
@@ -217,9 +218,8 @@ class LiveSystem(SlamSystem):
 
     def _is_estimating(self, waiting: float) -> bool:
         calibration = self.calibration
-        if calibration is None or not calibration.adopts:
-            return False
-        return waiting < np.inf and calibration.busy
+        adopts = calibration is not None and calibration.adopts
+        return adopts and waiting < np.inf and calibration.busy
 
     def _is_behind(self, waiting: float) -> bool:
         is_full = waiting < np.inf and self.dense is not None and self.dense.full

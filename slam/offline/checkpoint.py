@@ -121,6 +121,8 @@ class Checkpoints:
             return
         start_s = time.perf_counter()
         system.restart()
+        if counters.frames:  # what other processes told while they were waited for
+            self._folder.write_events(system.events.take())
         skipped = [(i, reason) for i, reason in self._sequence.skipped if i < counters.next_index]
         checkpoint = Checkpoint(
             self._options,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from bmask_slam.calibration.camera_check import CameraCheck, check_camera
 from bmask_slam.evaluation import Row
+from bmask_slam.features.brisk import Features
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.graph.whole_file import remove
@@ -25,6 +26,8 @@ from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.runtime.progress import Progress
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.sequences.cameras import format_camera
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.prefetch import FEATURES_AHEAD, prefetched
 from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_interface import System
@@ -134,19 +137,19 @@ def _begin(run: ActiveRun, checkpoints: Checkpoints) -> None:
 def process_frames(run: ActiveRun) -> bool:
     """Process the remaining frames; whether the run is to begin anew, with the camera found."""
     system, counters, remaining = run.system, run.counters, run.remaining
-    frames = run.sequence.frames(remaining.start, remaining.stop, remaining.step)
+    frames = _prepared(run) if run.options.parallel else _plain(run)
     checkpoints = Checkpoints(run.folder, run.options, run.sequence, run.calibrator, run.unwritten)
     if not counters.frames:
         _begin(run, checkpoints)
-    fuse = _dense_follower(run) if run.options.dense else None
+    fuse = _dense_follower(run) if run.options.dense and not run.options.parallel else None
     start_s, done = time.perf_counter() - counters.wall_s, len(run.indices) - len(remaining)
     with (
         closing(frames),
         Progress(len(run.indices), run.options.quiet, done) as bar,
         _snapshots(run) as snapshot,
     ):
-        for frame in frames:
-            result = system.process(frame)
+        for ready in frames:
+            result = system.process(*ready)
             run.folder.write_frame(result)
             counters.count(result)
             if fuse is not None:
@@ -166,6 +169,20 @@ def process_frames(run: ActiveRun) -> bool:
             checkpoints.write(system, counters)
     logger.info("%d frames in %.1f s", counters.frames, counters.wall_s)
     return False
+
+
+def _plain(run: ActiveRun) -> Generator[tuple[Frame], None, None]:
+    """The remaining frames."""
+    remaining = run.remaining
+    with closing(run.sequence.frames(remaining.start, remaining.stop, remaining.step)) as frames:
+        for frame in frames:
+            yield (frame,)
+
+
+def _prepared(run: ActiveRun) -> Generator[tuple[Frame, Features], None, None]:
+    """The remaining frames and their features, which a thread finds ahead of tracking."""
+    prepare = run.system.prepare
+    return prefetched(((frame, prepare(frame)) for (frame,) in _plain(run)), FEATURES_AHEAD)
 
 
 def _is_to_begin_anew(run: ActiveRun, last: bool) -> bool:

@@ -15,9 +15,9 @@ from bmask_slam.system_config import SystemConfig
 _PATHS = ("sequence", "camera", "reference", "map")
 _RECORDED = (
     *(*_PATHS, "config_name", "max_frames", "stride", "checkpoint_every", "dense"),
-    *("calibrate", "mesh_voxel_m"),
+    *("calibrate", "mesh_voxel_m", "parallel"),
 )
-_ADDED = {"mesh_voxel_m": None}
+_ADDED = {"mesh_voxel_m": None, "parallel": False}
 """What checkpoints written before do not have."""
 _FLAGS = {"map": "--continue", "dense": "--map", "mesh_voxel_m": "--mesh-voxel"}
 """Flags that differ from the name of their field."""
@@ -45,6 +45,7 @@ class RunOptions:
             "auto", and used where that is sure; "report", and only said; "off".
         dense: also make a dense map, fusing keyframes while the run goes on.
         mesh_voxel_m: edge of its voxels, for a preview; None: 0.01.
+        parallel: tracking, map and masks each have a process, and work at the same time.
         quiet: no progress bar.
     """
 
@@ -63,6 +64,7 @@ class RunOptions:
     calibrate: str = "auto"
     dense: bool = False
     mesh_voxel_m: float | None = None
+    parallel: bool = False
     quiet: bool = False
 
     def __post_init__(self) -> None:
@@ -72,6 +74,11 @@ class RunOptions:
                 raise InputError(f"{_flag(option)} {value}: must be a whole number of at least 1")
         if self.calibrate not in CALIBRATE:
             raise InputError(f"--calibrate {self.calibrate}: is not one of {', '.join(CALIBRATE)}")
+        if self.parallel and (self.map or self.localise):
+            raise InputError(
+                "--parallel: begins a map of its own; give it without "
+                + ("--localise" if self.localise else "--continue")
+            )
         if self.localise is None:
             return
         for option in ("map", "checkpoint_every", "dense"):

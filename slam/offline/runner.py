@@ -7,7 +7,8 @@ import logging
 import platform
 import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import fields, replace
 from functools import partial
 from importlib.metadata import version
@@ -23,6 +24,7 @@ from bmask_slam.graph.extras import import_dense
 from bmask_slam.graph.sensors.streams import read_folder
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps
 from bmask_slam.graph.trajectory_formats import read_trajectory
+from bmask_slam.labelling.mask_memory import MaskMemory, RememberingSegmenter
 from bmask_slam.offline.checkpoint import Checkpoint, read_checkpoint
 from bmask_slam.offline.frame_loop import (
     ActiveRun,
@@ -32,7 +34,7 @@ from bmask_slam.offline.frame_loop import (
 )
 from bmask_slam.offline.map_localisation import MapLocalisation
 from bmask_slam.offline.options import RunOptions
-from bmask_slam.offline.self_calibration import RememberingSegmenter, SelfCalibrator
+from bmask_slam.offline.self_calibration import SelfCalibrator
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder
 from bmask_slam.run_folder.map_file import read_map
 from bmask_slam.run_folder.metrics import RunCounters
@@ -40,7 +42,6 @@ from bmask_slam.run_folder.open_files import free_run_path
 from bmask_slam.run_folder.origin import Origin
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.runtime.stop_request import StopRequest
-from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
 from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system import SlamSystem
@@ -72,9 +73,10 @@ def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummar
     with (
         RunFolder(options.out or free_run_path(name), options.overwrite) as folder,
         StopRequest() as stop,
+        ExitStack() as stack,
     ):
         describe_run(folder, options, sequence)
-        make, masks = _system_maker(make_system, options, sequence)
+        make, masks = stack.enter_context(_system_maker(make_system, options, sequence))
         calibrator = _calibrator(options, inherited_calibration(options, sequence), masks)
         if calibrator.state.adopted:
             sequence = open_sequence(options.sequence, camera=calibrator.state.camera)
@@ -109,11 +111,13 @@ def resume(
     sequence = _reopened(options, checkpoint)
     checkpoint.check_sequence(sequence)
     reference = find_reference(options.reference, sequence)
-    make, masks = _system_maker(make_system, options, sequence)
-    counters, system = checkpoint.counters, make(sequence.camera, options.config)
-    system.restore(checkpoint.state, path / CHECKPOINT)
-    checkpoint = replace(checkpoint, state={})  # it is as large as the map
-    with RunFolder(path, resume_bytes=checkpoint.sizes) as folder, StopRequest() as stop:
+    with ExitStack() as stack:
+        make, masks = stack.enter_context(_system_maker(make_system, options, sequence))
+        counters, system = checkpoint.counters, make(sequence.camera, options.config)
+        system.restore(checkpoint.state, path / CHECKPOINT)
+        checkpoint = replace(checkpoint, state={})  # it is as large as the map
+        folder = stack.enter_context(RunFolder(path, resume_bytes=checkpoint.sizes))
+        stop = stack.enter_context(StopRequest())
         logger.info("resumed after %d frames: %s", counters.frames, shlex.join(sys.argv))
         if not counters.frames:
             logger.warning("%s: no checkpoint was reached; starting from the beginning", path)
@@ -138,7 +142,7 @@ def _finished(active: ActiveRun, make_system: MakeSystem) -> RunSummary:
 
 
 def _calibrator(
-    options: RunOptions, state: SelfCalibration, masks: RememberingSegmenter | None
+    options: RunOptions, state: SelfCalibration, masks: MaskMemory | None
 ) -> SelfCalibrator:
     """What looks for readout, delay and bend of the camera; nothing in a run that uses a map."""
     mode = "off" if options.map or options.localise else options.calibrate
@@ -207,25 +211,30 @@ def describe_run(folder: RunFolder, options: RunOptions, sequence: Sequence) -> 
         logger.info("frame %d is broken: %s", index, reason)
 
 
+@contextmanager
 def _system_maker(
     given: MakeSystem | None, options: RunOptions, sequence: Sequence
-) -> tuple[MakeSystem, RememberingSegmenter | None]:
+) -> Iterator[tuple[MakeSystem, MaskMemory | None]]:
     """A given maker of systems, or that of `SlamSystem` with the segmenter of its configuration.
 
-    The second is that segmenter if it keeps masks for a run that begins anew. Raises InputError.
+    The second keeps masks for a run that begins anew, if it may. Raises InputError.
     """
-    if given is not None:
-        return given, None
-    if options.dense:
+    chosen, folder = options.config.semantics.segmenter, sequence.folder
+    if given is None and options.dense:
         import_dense("--map")
-    chosen = options.config.semantics.segmenter
-    segmenter = (
-        NoSegmenter() if options.localise else make_segmenter(chosen, sequence.folder, find_weights)
-    )
-    if options.calibrate != "auto" or options.map or options.localise:
-        return partial(SlamSystem, segmenter=segmenter), None
-    masks = RememberingSegmenter(segmenter)
-    return partial(SlamSystem, segmenter=masks), masks
+    if given is not None:
+        yield given, None
+    elif options.parallel:
+        from bmask_slam.parallel.system import ParallelSystems  # noqa: PLC0415 - if asked for
+
+        with closing(ParallelSystems(chosen, folder)) as systems:
+            yield systems, systems.memory
+    elif options.localise:
+        yield SlamSystem, None
+    else:
+        masks = MaskMemory()
+        segmenter = RememberingSegmenter(make_segmenter(chosen, folder, find_weights), masks)
+        yield partial(SlamSystem, segmenter=segmenter), masks
 
 
 def with_sensors(system: System, sequence: Sequence) -> System:

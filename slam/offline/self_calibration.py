@@ -24,45 +24,13 @@ from bmask_slam.calibration.adoption import (
 )
 from bmask_slam.calibration.rematching import estimate_again
 from bmask_slam.calibration.views import SequenceDepths
-from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
-from bmask_slam.semantics.instances.instances import Instance, PackedMask
-from bmask_slam.semantics.instances.surfaces import Segmented, SurfaceClasses, surfaces_of
-from bmask_slam.semantics.segmenters.segmenter import Segmenter
+from bmask_slam.labelling.mask_memory import MaskMemory
 from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_interface import System
 
 logger = logging.getLogger(__name__)
-
-_Packed = tuple[list[tuple[Instance, PackedMask]], SurfaceClasses | None]
-
-
-class RememberingSegmenter:
-    """A segmenter that keeps what it found, one bit a pixel, for frames that are tracked again."""
-
-    def __init__(self, segmenter: Segmenter) -> None:
-        self.labels = segmenter.labels
-        self.measured = getattr(segmenter, "measured", "")
-        self._segmenter = segmenter
-        self._found: dict[str, _Packed] | None = {}
-
-    def segment(self, image: Image, name: str) -> list[Instance]:
-        """The instances in an image, as the segmenter found them the first time."""
-        if self._found is None:
-            return self._segmenter.segment(image, name)
-        if name in self._found:
-            packed, surfaces = self._found[name]
-            whole = [replace(i, mask=mask.unpacked()) for i, mask in packed]
-            return Segmented(whole, surfaces)
-        instances = self._segmenter.segment(image, name)
-        packed = [(replace(i, mask=i.mask[:0]), PackedMask.of(i.mask)) for i in instances]
-        self._found[name] = packed, surfaces_of(instances)
-        return instances
-
-    def forget(self) -> None:
-        """Keep nothing any more: no frame is tracked again."""
-        self._found = None
 
 
 class SelfCalibrator:
@@ -80,7 +48,7 @@ class SelfCalibrator:
         self,
         state: SelfCalibration,
         mode: str,
-        masks: RememberingSegmenter | None = None,
+        masks: MaskMemory | None = None,
         config: SelfCalibrationConfig | None = None,
     ) -> None:
         self.state = state

@@ -8,6 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+FEATURES_AHEAD = 2
+"""Number of frames whose features are extracted ahead of tracking, unless frames may be dropped."""
 
 
 def prefetched(items: Iterable[T], depth: int) -> Generator[T, None, None]:

@@ -30,6 +30,8 @@ from bmask_slam.live.messages import (
     AddMeasurements,
     ChangeOwnFactors,
     Finish,
+    FramesTracked,
+    Handled,
     LostKeyframe,
     MapChanged,
     MapSaved,
@@ -47,7 +49,6 @@ from bmask_slam.live.messages import (
     StateSaved,
     TellObjects,
     UseCamera,
-    VisibilityCounts,
 )
 from bmask_slam.live.replica import DeltaMaker
 from bmask_slam.runtime.memory import give_back_memory
@@ -120,9 +121,7 @@ class MapServer:
         self._send(Started(number))
         match message:
             case NewKeyframe():
-                if number > self._resent:  # else tracking may have been told to remove it
-                    self._deltas.has_features(message.id)
-                self.add_keyframe(message)
+                self.add_keyframe(number, message)
             case LostKeyframe():
                 self.skip_keyframe(message)
             case Masks():
@@ -139,6 +138,8 @@ class MapServer:
                 self._resent = message.number
             case TellObjects() | SaveMap():
                 self.answer(message)
+            case FramesTracked():
+                self._add_frames(message)
             case Finish():
                 self.system.mapper.history.extend(message.history)
                 self.system.finish()
@@ -146,6 +147,7 @@ class MapServer:
                 self._send(StateSaved(number, message.path))
             case _:
                 raise TypeError(f"not a message for the map: {message!r}")
+        self._send(Handled(number))
 
     def take_from_user(self, message: AddMeasurements | ChangeOwnFactors) -> None:
         """Measurements, or changes of a user's factors; one that cannot enter is reported."""
@@ -182,10 +184,8 @@ class MapServer:
         system.camera = system.camera_tracker.tracker.camera = message.camera
         use_camera(system.mapper, message.camera, message.motions)
         self.send_changes(-1, done=False)
-        elapsed_ms = 1e3 * (time.perf_counter() - started_s)
-        logger.info(
-            "camera: %d keyframes interpreted anew in %.0f ms", len(message.motions), elapsed_ms
-        )
+        ms, count = 1e3 * (time.perf_counter() - started_s), len(message.motions)
+        logger.info("camera: %d keyframes interpreted anew in %.0f ms", count, ms)
 
     def save(self, number: int, path: Path) -> None:
         """Save the state; messages up to this number are then not needed any more."""
@@ -211,18 +211,18 @@ class MapServer:
         self._send(MapSaved(message.path, failure))
 
     def _write(self, path: Path) -> None:
-        header = {"camera": asdict(self.system.camera)}
-        write_arrays(path, STATE_FILE, header, self.system.state())
+        write_arrays(path, STATE_FILE, {"camera": asdict(self.system.camera)}, self.system.state())
 
-    def add_keyframe(self, message: NewKeyframe) -> None:
+    def add_keyframe(self, number: int, message: NewKeyframe) -> None:
         """Add a keyframe that tracking made; changes are sent before and after optimisation."""
         started_s = time.perf_counter()
+        if number > self._resent:  # else tracking may have been told to remove it
+            self._deltas.has_features(message.id)
         system = self.system
         if not self._has_reference(message):
             self.skip_keyframe(LostKeyframe(message.id, NO_KEYFRAME, np.eye(4), message.history))
             return
-        self._count_visibility(message.visibility)
-        system.mapper.history.extend(message.history)
+        self._add_frames(message)
         tracked, segment = self._updated(message)
         no_images = np.zeros((0, 0, 3), np.uint8), np.zeros((0, 0), np.float32)
         frame = Frame(message.frame_index, message.timestamp_s, *no_images)
@@ -270,11 +270,13 @@ class MapServer:
         newest = mapper.sensors.newest
         self._send(MapChanged(keyframe_id, delta, done, update_ms, loops, newest))
 
-    def _count_visibility(self, visibility: VisibilityCounts) -> None:
-        landmarks = self.system.mapper.world.landmarks
-        ids = landmarks.current(visibility.ids)
-        np.add.at(landmarks.visible, ids, visibility.visible)
-        np.add.at(landmarks.found, ids, visibility.found)
+    def _add_frames(self, message: NewKeyframe | FramesTracked) -> None:
+        """Add the frames since the last keyframe, and how often they saw landmarks."""
+        self.system.mapper.history.extend(message.history)
+        landmarks, counts = self.system.map.world.landmarks, message.visibility
+        ids = landmarks.current(counts.ids)
+        np.add.at(landmarks.visible, ids, counts.visible)
+        np.add.at(landmarks.found, ids, counts.found)
 
     def _updated(self, message: NewKeyframe) -> tuple[Tracked, int]:
         """The tracked frame in the map as it is now, and its segment."""

@@ -34,10 +34,14 @@ MAX_CRASHES = 3
 
 @dataclass(frozen=True)
 class MapPlace:
-    """Where the map's process runs, and the folder of its states, which is one of this machine."""
+    """Where the map's process runs, and the folder of its states, which is one of this machine.
+
+    Here it may begin with the state of a file, ``begins_with``.
+    """
 
     folder: Path
     workstation: Workstation | None = None
+    begins_with: Path | None = None
 
 
 class MapWorker:
@@ -67,7 +71,7 @@ class MapWorker:
         self.crashes = self.losses = 0
         self._place = place
         self._arguments, self._replacement = arguments, replacement
-        self.state: Path | None = None
+        self.state = place.begins_with
         self.saves = self._saved = 0  # messages that the last state contains
         self._return: MapReturn | None = None
         self._early: list[Any] = []
@@ -99,6 +103,11 @@ class MapWorker:
     def pid(self) -> int:
         """Process id."""
         return self._worker.pid
+
+    @property
+    def sent(self) -> int:
+        """The number of the last message."""
+        return self._number
 
     @property
     def given_up(self) -> bool:
@@ -240,7 +249,7 @@ class MapWorker:
             there = self._place.workstation.worker("map", (*self._arguments, 0), None)
             self._standby = Worker("map", STANDBY)
             return there
-        return Worker("map", TARGET, *self._arguments, None, 0)
+        return Worker("map", TARGET, *self._arguments, self.state, 0)
 
     def _without_own(self, messages: list[Any]) -> list[Any]:
         """Handle the messages about the process itself; returns the others."""

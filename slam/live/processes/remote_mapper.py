@@ -21,6 +21,7 @@ from bmask_slam.labelling.semantic_mapper import kept_depth
 from bmask_slam.live.messages import (
     AddMeasurements,
     Finish,
+    Handled,
     LostKeyframe,
     MapChanged,
     MapSaved,
@@ -77,8 +78,7 @@ class RemoteMapper:
         self.events = EventLog()
         self.sensors = SensorFusion(config.sensors, EventLog())  # the process reports
         self.update_ms: list[float] = []
-        self.loops_closed = 0
-        self.changes = 0
+        self.loops_closed = self.changes = 0
         self.reference: Keyframe | None = None
         self._folder, self._has_labels = place.folder, len(names) > 1
         self.objects: MapObjects | None = None
@@ -208,7 +208,7 @@ class RemoteMapper:
                     self.objects, self._asked = message.objects, False
                 case MapSaved():
                     self.maps_saved.append(message)
-                case _:
+                case _ if not isinstance(message, Handled):
                     others.append(message)
         return others
 

@@ -29,9 +29,10 @@ from bmask_slam.graph.calibration.cross_validation import CrossValidation
 from bmask_slam.graph.calibration.model import BEND, LENS, PARAMETERS, SHUTTER, TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.labelling.mask_memory import MaskMemory, RememberingSegmenter
 from bmask_slam.offline import checkpoint, frame_loop, runner
 from bmask_slam.offline.runner import RunOptions, RunSummary, resume, run
-from bmask_slam.offline.self_calibration import RememberingSegmenter, SelfCalibrator
+from bmask_slam.offline.self_calibration import SelfCalibrator
 from bmask_slam.run_folder.map_file import read_run
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
@@ -267,13 +268,14 @@ def test_masks_are_kept_while_the_run_may_begin_anew() -> None:
             return [Instance(mask, mask_box(mask), 1, certain(1, 2), 1.0, 0.5)]
 
     inner, image = Counting(), np.zeros((11, 13, 3), np.uint8)
-    masks = RememberingSegmenter(inner)
+    memory = MaskMemory()
+    masks = RememberingSegmenter(inner, memory)
     first, again = masks.segment(image, "a.png"), masks.segment(image, "a.png")
     assert inner.calls == 1
     np.testing.assert_array_equal(first[0].mask, again[0].mask)
     assert again[0].mask_score == 0.5 and again[0].label == 1
     camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
-    SelfCalibrator(SelfCalibration(camera, camera, settled=True), "auto", masks)
+    SelfCalibrator(SelfCalibration(camera, camera, settled=True), "auto", memory)
     masks.segment(image, "a.png")
     assert inner.calls == 2
 

@@ -1,0 +1,216 @@
+"""The other processes' answers, each used at a frame that does not depend on how fast they are.
+
+What tracking sends with a frame is answered before the frame that is ``LAG`` later, and not used
+earlier, however soon it comes. So tracking, map and masks work at the same time, and a run that is
+repeated gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from bmask_slam.features.descriptor_index import DescriptorIndex
+from bmask_slam.graph.arrays import Arrays
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import part
+from bmask_slam.labelling.mask_memory import MaskMemory
+from bmask_slam.live.messages import FramesTracked, Handled, ImageToSegment, Masks, SaveState
+from bmask_slam.live.processes.map_worker import MapPlace, MapWorker
+from bmask_slam.live.processes.remote_mapper import RemoteMapper
+from bmask_slam.live.processes.segmentation import RemoteSegmenter
+from bmask_slam.live.processes.supervision import RestartPolicy
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.world_map import Keyframe, WorldMap
+
+logger = logging.getLogger(__name__)
+
+LAG = 3
+"""Frames after which answers are used: about as long as the map works on a keyframe."""
+WAIT_S = 600.0
+"""Longest wait for an answer."""
+
+
+class LockstepMapper(RemoteMapper):
+    """A remote mapper whose answers are applied at frames that are the same in every run.
+
+    Once its process has died that is given up: the run goes on as a live one does.
+    """
+
+    def __init__(
+        self, camera: Camera, config: SystemConfig, names: tuple[str, ...], place: MapPlace
+    ) -> None:
+        self._about, self._place = (camera, config, names), place
+        self._finishes = False
+        self._begin()
+        super().__init__(*self._about, place)
+
+    def _begin(self) -> None:
+        """A process begins, to which nothing was sent."""
+        self._handled = self._due = 0  # numbers of messages
+        self._answers: deque[Any] = deque()
+        self._ends: deque[int] = deque()  # last messages of frames
+        self._kept: list[Any] = []
+
+    def begin_frame(self) -> None:
+        """Answers to what was sent until ``LAG`` frames ago are due."""
+        while len(self._ends) >= LAG:
+            self._due = self._ends.popleft()
+
+    def end_frame(self) -> None:
+        """What was sent since the last call belongs to this frame."""
+        self._ends.append(self.worker.sent)
+
+    def use_all(self) -> None:
+        """Wait for all answers and use them; other messages are kept for ``catch_up``."""
+        self._due = self.worker.sent
+        self._ends.clear()
+        self._kept = self.catch_up()
+
+    def catch_up(self, timeout_s: float = 0.0) -> list[Any]:
+        """Apply the answers that are due, once they have come; returns the other messages.
+
+        Raises:
+            InputError: one does not come.
+        """
+        others, self._kept = self._kept, []
+        until_s = time.monotonic() + WAIT_S
+        while self._handled < self._due and not self._goes_on_freely:
+            self._answers.extend(self.worker.receive(0.0 if self._answers else 0.1))
+            while self._answers and self._handled < self._due:
+                others += self._apply_answers([self._answers.popleft()])
+            if self.worker.has_crashed:
+                logger.warning("this run does not give the same bytes again")
+                self._answers.extend(self.worker.receive_last())
+                self.worker.restart()
+            elif time.monotonic() > until_s:
+                raise InputError(f"the map's process has not answered for {WAIT_S:.0f} s")
+        if self._goes_on_freely:
+            others += self._apply_answers(list(self._answers))
+            self._answers.clear()
+            others += super().catch_up(timeout_s)
+        return others
+
+    @property
+    def _goes_on_freely(self) -> bool:
+        """Whether answers are used as they come: at the end, or after the process has died."""
+        return self._finishes or self.worker.crashes > 0
+
+    def _apply_answers(self, messages: list[Any]) -> list[Any]:
+        others = []
+        for message in messages:
+            if isinstance(message, Handled):
+                self._handled = message.number
+            others += super()._apply_answers([message])
+        return others
+
+    def wait_for(self, keyframe: Keyframe, timeout_s: float) -> bool:
+        """Use all answers, so that a keyframe has its landmarks; whether it has."""
+        self.use_all()
+        return len(self.world.observed(keyframe)[1]) > 0
+
+    def send_frames(self) -> None:
+        """Tell the map of the frames since the last keyframe, if there are any."""
+        frames = FramesTracked(self._visibility_counts(), self._unsent_history())
+        if len(frames.history) or len(frames.visibility.ids):
+            self.send(frames)
+
+    def write_state(self, path: Path) -> None:
+        """Let the process write its state, and wait for that.
+
+        Raises:
+            InputError: it could not.
+        """
+        saves = self.worker.saves
+        self.send(SaveState(path))
+        self.use_all()
+        if self.worker.saves == saves:
+            raise InputError(f"{path}: the map's process could not write its state")
+
+    def begin_with(self, path: Path, state: Arrays) -> None:
+        """Go on from a state, which a file holds too, with a new process and a new copy."""
+        self.worker.kill()
+        place = replace(self._place, begins_with=path)
+        self.worker = MapWorker(self._about, self._replacement, place)
+        self._begin()
+        self.world, self.history = WorldMap(), FrameHistory()
+        self.places = DescriptorIndex(self._about[1].loops.index)
+        self.history.restore(part(state, "mapper.history"))
+        self.sensors.restore(part(state, "mapper.sensors"))
+        self.update_ms = state["mapper.update_ms"].tolist()
+        self._pending, self._sent_frames = set(), len(self.history.since(0))
+        changes, until_s = self.changes, time.monotonic() + RestartPolicy().start_s
+        while self.changes == changes:  # its first answer is the whole map
+            self._apply_answers(self.worker.receive(0.1))
+            if self.worker.has_crashed or time.monotonic() > until_s:
+                raise InputError(f"{path}: the map's process cannot go on from it")
+
+    def finish(self, timeout_s: float) -> Path:
+        """As ``RemoteMapper.finish``."""
+        self._finishes = True
+        return super().finish(timeout_s)
+
+
+class LockstepSegmenter:
+    """A remote segmenter whose masks are used at frames that are the same in every run.
+
+    Attributes:
+        labels: classes of the segmenter. worker: its process.
+    """
+
+    def __init__(self, remote: RemoteSegmenter, memory: MaskMemory) -> None:
+        """Masks of images that the memory knows are not made again."""
+        self.labels, self.worker = remote.labels, remote.worker
+        self._remote, self._memory = remote, memory
+        self._frame = 0
+        self._requested: deque[tuple[int, ImageToSegment]] = deque()
+        self._found: dict[int, Masks] = {}
+
+    def begin_frame(self) -> None:
+        """Masks that were requested ``LAG`` frames ago are due."""
+        self._frame += 1
+
+    def use_all(self) -> None:
+        """All masks that were requested are due."""
+        self._frame += LAG
+
+    @property
+    def waiting(self) -> int:
+        """Number of keyframes whose masks were not used yet."""
+        return len(self._requested)
+
+    def awaits(self, keyframe_id: int) -> bool:
+        """Whether the masks of a keyframe will still be used."""
+        return any(image.keyframe_id == keyframe_id for _, image in self._requested)
+
+    def request(self, image: ImageToSegment) -> None:
+        """Request the masks of a keyframe; returns at once."""
+        self._requested.append((self._frame, image))
+        known = self._memory.recall(image.name)
+        if known is None:
+            self._remote.request(image)
+        else:
+            self._found[image.keyframe_id] = Masks(image.keyframe_id, known)
+
+    def receive_masks(self) -> list[Masks]:
+        """The masks that are due, once they have come."""
+        due = []
+        while self._requested and self._requested[0][0] <= self._frame - LAG:
+            _, image = self._requested.popleft()
+            while image.keyframe_id not in self._found and self._remote.awaits(image.keyframe_id):
+                self._found |= {masks.keyframe_id: masks for masks in self._remote.receive_masks()}
+                time.sleep(0.001)
+            if (masks := self._found.pop(image.keyframe_id, None)) is not None:
+                self._memory.keep(image.name, masks.instances)
+                due.append(masks)
+        return due
+
+    def close(self) -> None:
+        """Kill the process."""
+        self._remote.close()

@@ -1,0 +1,169 @@
+"""A system whose map and masks are in processes of their own, in lockstep with tracking."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.arrays import Arrays
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.array_file import nested, part, read_arrays, write_arrays
+from bmask_slam.labelling.mask_memory import MaskMemory
+from bmask_slam.live.messages import STATE_FILE
+from bmask_slam.live.processes.map_process import LabelsOnly
+from bmask_slam.live.processes.map_worker import MapPlace
+from bmask_slam.live.processes.segmentation import RemoteSegmenter
+from bmask_slam.live.system import LiveSystem
+from bmask_slam.parallel.lockstep import LockstepMapper, LockstepSegmenter
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import FrameResult
+
+
+class ParallelSystem(LiveSystem):
+    """Tracks in this process; map and masks follow in others, at frames that do not vary.
+
+    State, graph and map are those after all that was sent to the others was done.
+    """
+
+    remote: LockstepMapper
+    segmenter: LockstepSegmenter | None
+    mapper_type = LockstepMapper
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: SystemConfig,
+        segmenter: LockstepSegmenter | None,
+        scratch: Path,
+    ) -> None:
+        """Start the map's process, whose temporary files go to ``scratch``."""
+        self._state_file = scratch / "state"
+        self._whole: tuple[int, Arrays] = -1, {}  # after so many messages
+        self._read: tuple[int, Mapper] | None = None
+        super().__init__(camera, config, MapPlace(scratch), segmenter)
+
+    def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
+        """Use what is due of the other processes, then do the same step as one process does."""
+        self.remote.begin_frame()
+        if self.segmenter is not None:
+            self.segmenter.begin_frame()
+        result = super().process(frame, features)
+        self.remote.end_frame()
+        return result
+
+    @property
+    def mapper(self) -> Mapper:
+        """Map and graph as they are now."""
+        if isinstance(self.map, Mapper):
+            return self.map
+        state, sent = self.state(), self.remote.worker.sent
+        if self._read is None or self._read[0] != sent:
+            self._read = sent, self._offline(state).mapper
+        return self._read[1]
+
+    def state(self) -> Arrays:
+        """See `SlamSystem.state`; waits for the other processes."""
+        if isinstance(self.map, Mapper):
+            return super().state()
+        self._settle()
+        if self._whole[0] != self.remote.worker.sent:
+            self.remote.write_state(self._state_file)
+            state = read_arrays(self._state_file, STATE_FILE)[1]
+            self._whole, self._read = (self.remote.worker.sent, state), None
+        reference = self.camera_tracker.reference
+        return {
+            **self._whole[1],
+            "segment": np.array(self.camera_tracker.segment),
+            "reference": np.array(-1 if reference is None else reference.id),
+            "frames_since_keyframe": np.array(self.keyframes.frames_since),
+            "first_keyframe": np.array(self._first_keyframe),
+            "mapper.events.now": self.events.state()["now"],
+            **nested(localiser=self.camera_tracker.state(), dynamics=self.moving_objects.state()),
+        }
+
+    def restore(self, state: Arrays, path: Path) -> None:
+        """See `SlamSystem.restore`."""
+        state = self._offline(state, path).state()  # checked, and as this version has it
+        self._begin_with(state)
+        self.camera_tracker.restore(part(state, "localiser"))
+        self.moving_objects.restore(part(state, "dynamics"))
+        self.camera_tracker.segment = int(state["segment"])
+        self.keyframes.frames_since = int(state["frames_since_keyframe"])
+        self._first_keyframe = int(state["first_keyframe"])
+
+    def restart(self) -> None:
+        """Go on with a new process and a new copy of the map, as a restored system does."""
+        self._begin_with(self.state())
+
+    def _begin_with(self, state: Arrays) -> None:
+        """Let the map's process, and the copy of the map, begin with a state."""
+        write_arrays(self._state_file, STATE_FILE, {"camera": asdict(self.camera)}, state)
+        self.remote.begin_with(self._state_file, state)
+        now = {"now": state["mapper.events.now"]}
+        self.events.restore({**self.events.state(), **now})
+        self.camera_tracker.reference = self.map.world.keyframes.get(int(state["reference"]))
+        self._whole = self.remote.worker.sent, state
+
+    def _offline(self, state: Arrays, path: Path | None = None) -> SlamSystem:
+        """A system of one process in a state, which comes from a file if one is named."""
+        labels = LabelsOnly(self.label_names, self.config.semantics.segmenter)
+        system = SlamSystem(self.camera, self.config, labels)
+        system.restore(state, path or self._state_file)
+        return system
+
+    def _settle(self) -> None:
+        """Use all that is still to come of the other processes."""
+        if self.segmenter is not None:
+            self.segmenter.use_all()
+        self.remote.send_frames()
+        sent = -1
+        while sent != self.remote.worker.sent:
+            sent = self.remote.worker.sent
+            self.remote.use_all()
+            self.catch_up()
+
+    def finish(self) -> None:
+        """The last optimisation; afterwards map and graph are in this process."""
+        self._settle()
+        super().finish()
+
+
+class ParallelSystems:
+    """Makes the systems of a run; one that begins anew takes over the segmenter's process.
+
+    Attributes:
+        memory: masks of the images that were segmented.
+    """
+
+    def __init__(self, masks: SegmenterOptions, sequence: Path) -> None:
+        """Start the segmenter, for the images of a sequence. Raises InputError if it cannot."""
+        self.memory = MaskMemory()
+        self._remote = None if masks.name == "none" else RemoteSegmenter(masks, sequence)
+        self._scratch = tempfile.TemporaryDirectory(
+            prefix="bmask-slam-", ignore_cleanup_errors=True
+        )
+        self._last: ParallelSystem | None = None
+
+    def __call__(self, camera: Camera, config: SystemConfig) -> ParallelSystem:
+        """A new system; the one before is ended."""
+        if self._last is not None:
+            self._last.remote.close()
+        segmenter = LockstepSegmenter(self._remote, self.memory) if self._remote else None
+        self._last = ParallelSystem(camera, config, segmenter, Path(self._scratch.name))
+        return self._last
+
+    def close(self) -> None:
+        """End all processes."""
+        if self._last is not None:
+            self._last.close()
+        if self._remote is not None:
+            self._remote.close()
+        self._scratch.cleanup()

@@ -1,0 +1,162 @@
+"""A run whose map and masks are in other processes: it repeats, is resumed, and survives them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from faults import children, wait_until
+
+from bmask_slam.config.configuration import from_tree
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.labelling.mask_memory import MaskMemory
+from bmask_slam.live.messages import ImageToSegment, Masks
+from bmask_slam.offline.runner import RunOptions, resume, run
+from bmask_slam.parallel.lockstep import LAG, LockstepSegmenter
+from bmask_slam.parallel.system import ParallelSystem
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import FrameResult
+
+FRAMES = 30
+SAME = ("trajectory.txt", "keyframes.txt", "landmarks.ply", "events.csv", "map", "labels.csv")
+
+
+def options(sequence: Path, out: Path, segmenter: str = "none", **more: object) -> RunOptions:
+    config = from_tree(SystemConfig, {"semantics": {"segmenter": {"name": segmenter}}}, "test")
+    return RunOptions(
+        sequence, config, out=out, quiet=True, max_frames=FRAMES, parallel=True, **more
+    )
+
+
+def result(folder: Path) -> dict[str, bytes]:
+    """The files of a run that hold no times."""
+    return {name: (folder / name).read_bytes() for name in SAME if (folder / name).exists()}
+
+
+def with_each_frame(
+    monkeypatch: pytest.MonkeyPatch, do: Callable[[ParallelSystem, int], object]
+) -> None:
+    """Do something before each frame is tracked."""
+    process = ParallelSystem.process
+
+    def then(system: ParallelSystem, frame: Frame, *more: object) -> FrameResult:
+        do(system, frame.index)
+        return process(system, frame, *more)
+
+    monkeypatch.setattr(ParallelSystem, "process", then)
+
+
+@pytest.fixture(scope="module")
+def whole(slow_office: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with true masks and checkpoints."""
+    out = tmp_path_factory.mktemp("parallel") / "run"
+    return run(options(slow_office, out, "truth", checkpoint_every=10)).folder
+
+
+def test_it_tracks_as_well_as_one_process_does(slow_office: Path, whole: Path, tmp_path) -> None:
+    alone = run(RunOptions(slow_office, out=tmp_path / "run", quiet=True, max_frames=FRAMES))
+    ours, theirs = (read_tum(path / "trajectory.txt") for path in (whole, alone.folder))
+    assert len(ours) == len(theirs) == FRAMES
+    apart_m = np.linalg.norm(
+        ours.poses_world_camera[:, :3, 3] - theirs.poses_world_camera[:, :3, 3], axis=1
+    )
+    assert apart_m.max() < 0.02
+    assert "labels.csv" in result(whole)
+
+
+def test_it_repeats_its_bytes_however_fast_the_others_are(
+    slow_office: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here answers wait for tracking, in the other run tracking waits for them."""
+    with_each_frame(monkeypatch, lambda system, index: time.sleep(0.1 * (index % 3)))
+    again = run(options(slow_office, tmp_path / "run", "truth", checkpoint_every=10))
+    assert result(again.folder) == result(whole)
+    assert not children()
+
+
+def test_killed_and_resumed_it_ends_in_the_same_bytes(
+    slow_office: Path, whole: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    words = ["--segmenter", "truth", "--parallel", "--checkpoint-every", "10", "--quiet"]
+    command = [sys.executable, "-m", "bmask_slam", "run", str(slow_office), "--out", str(out)]
+    process = subprocess.Popen([*command, *words, "--max-frames", str(FRAMES)])
+
+    def has_written_25_frames() -> bool:
+        frames = out / "frames.csv"
+        return frames.is_file() and len(frames.read_text().splitlines()) > 25
+
+    wait_until(has_written_25_frames)
+    process.kill()
+    process.wait()
+    assert resume(out) is not None
+    assert result(out) == result(whole)
+
+
+def test_it_goes_on_when_the_maps_process_dies(
+    slow_office: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def kill(system: ParallelSystem, index: int) -> None:
+        if index == FRAMES // 2:
+            os.kill(system.remote.worker.pid, signal.SIGKILL)
+
+    with_each_frame(monkeypatch, kill)
+    folder = run(options(slow_office, tmp_path / "run")).folder
+    assert len(read_tum(folder / "trajectory.txt")) == FRAMES
+    assert "does not give the same bytes again" in (folder / "log.txt").read_text()
+
+
+def test_a_map_of_another_run_is_refused(slow_office: Path, whole: Path) -> None:
+    with pytest.raises(InputError, match=r"--parallel: .* without --continue"):
+        options(slow_office, whole, map=whole)
+
+
+class SlowSegmenter(SimpleNamespace):
+    """A segmenter whose masks are there once they were asked for often enough."""
+
+    def __init__(self) -> None:
+        super().__init__(labels=label_set(("cup",)), worker=None, asked={}, seen=[])
+
+    def request(self, image: ImageToSegment) -> None:
+        self.asked[image.keyframe_id] = 3
+        self.seen.append(image.name)
+
+    def awaits(self, number: int) -> bool:
+        return number in self.asked
+
+    def receive_masks(self) -> list[Masks]:
+        self.asked = {number: left - 1 for number, left in self.asked.items()}
+        come = [number for number, left in self.asked.items() if left == 0]
+        for number in come:
+            del self.asked[number]
+        return [Masks(number, []) for number in come]
+
+
+def test_masks_are_used_some_frames_later_and_made_once_an_image() -> None:
+    remote, memory = SlowSegmenter(), MaskMemory()
+    image = np.zeros((2, 2, 3), np.uint8)
+    for _ in range(2):  # the run begins anew
+        segmenter = LockstepSegmenter(remote, memory)
+        used = []
+        for frame in range(8):
+            segmenter.begin_frame()
+            used += [(frame, masks.keyframe_id) for masks in segmenter.receive_masks()]
+            if frame in (0, 1, 4):
+                segmenter.request(ImageToSegment(frame, image, f"{frame}.png"))
+        assert used == [(LAG, 0), (LAG + 1, 1), (LAG + 4, 4)]
+        assert segmenter.waiting == 0
+    assert remote.seen == ["0.png", "1.png", "4.png"]
+    segmenter.request(ImageToSegment(9, image, "9.png"))
+    segmenter.use_all()
+    assert [masks.keyframe_id for masks in segmenter.receive_masks()] == [9]
