@@ -135,6 +135,13 @@ class ObservationTable:
         """All rows of these landmarks."""
         return _rows_of(self.of_landmark, ids)
 
+    def rows_left(self, keyframes: Ints, removed: Ints) -> Ints:
+        """The rows of many keyframes but for those (M,) that are removed, ascending."""
+        left = np.isin(self._columns.keyframe_ids[: self._used], keyframes)
+        left[self._free] = False
+        left[removed] = False
+        return np.flatnonzero(left)
+
     def all(self) -> Observations:
         """All observations, ordered by keyframe, then landmark."""
         return self.select(self.all_rows())
@@ -294,5 +301,4 @@ def _discard(index: dict[int, dict[int, int]], first: int, second: int) -> None:
 
 
 def _rows_of(index: dict[int, dict[int, int]], ids: Iterable[int]) -> Ints:
-    rows = {row for i in ids for row in index.get(i, {}).values()}
-    return np.array(sorted(rows), np.int64)
+    return np.unique(np.array([r for i in ids for r in index.get(i, {}).values()], np.int64))

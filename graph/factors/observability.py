@@ -12,6 +12,8 @@ from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 
+SPARSE = 10
+"""Landmarks are numbered anew where they have more than so many ids for each observation."""
 Edges = Sequence[tuple[int, ...]]
 """Keyframe ids of pose factors: one for a prior, two for a relative pose."""
 
@@ -118,10 +120,16 @@ def component_labels(ids: Ints, observations: Observations, edges: Edges) -> Int
 
 def shared_landmarks(ids: Ints, observations: Observations) -> csr_array:
     """How many landmarks each two of the sorted ids (K,) share: (K, K), sparse."""
-    names, landmark = np.unique(observations.landmark_ids, return_inverse=True)
+    landmark = observations.landmark_ids
+    if len(landmark):
+        landmark = landmark - landmark.min()
+    width = landmark.max(initial=0) + 1
+    if width > SPARSE * len(landmark):
+        names, landmark = np.unique(landmark, return_inverse=True)
+        width = len(names)
     rows = np.searchsorted(ids, observations.keyframe_ids)
     ones = np.ones(len(rows), np.int64)
-    sees = coo_array((ones, (rows, landmark)), (len(ids), len(names))).tocsr()
+    sees = coo_array((ones, (rows, landmark)), (len(ids), width)).tocsr()
     return (sees @ sees.T).tocsr()
 
 

@@ -157,11 +157,12 @@ def _still_linked(
     edges = set(tables.numbers_of_keyframes(near.tolist())) - set(numbers)
     part = firm_components(
         near,
-        table.select(np.setdiff1d(table.rows_of_keyframes(near.tolist()), rows)),
+        table.select(table.rows_left(near, rows)),
         [factors[number].link for number in sorted(edges)],
         config.min_left_observations,
     )[np.searchsorted(near, touched)]
-    return len(np.unique(group)) == len(np.unique(np.stack([group, part]), axis=1).T)
+    group = np.unique(group, return_inverse=True)[1]
+    return group.max() + 1 == len(np.unique(group * len(near) + part))
 
 
 def _remove_from_tables(plan: _Plan, tables: FactorTables) -> list[int]:

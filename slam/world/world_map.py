@@ -274,14 +274,16 @@ class WorldMap:
         while (remap[remap] != remap).any():  # follow chains of duplicates
             remap = remap[remap]
         new_ids = remap[old_ids]
-        involved = np.zeros(len(self.landmarks) + 1, bool)
+        involved, present = np.zeros((2, len(self.landmarks) + 1), bool)
         involved[old_ids] = True
         for keyframe in self.keyframes.values():
             rows = np.flatnonzero(involved[keyframe.landmark_ids])
             if len(rows) == 0:
                 continue
             targets = remap[keyframe.landmark_ids[rows]]
-            occupied = np.isin(targets, keyframe.landmark_ids)
+            present[keyframe.landmark_ids] = True
+            occupied = present[targets]
+            present[keyframe.landmark_ids] = False
             _, first = np.unique(targets, return_index=True)
             repeated = np.ones(len(targets), bool)
             repeated[first] = False
