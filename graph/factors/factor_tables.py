@@ -103,13 +103,9 @@ class ObservationTable:
 
     def remeasure(self, observations: Observations) -> None:
         """Replace the measurements of those of the observations that are in the table."""
-        pairs = zip(
-            observations.keyframe_ids.tolist(), observations.landmark_ids.tolist(), strict=True
-        )
-        rows = [self.row(*pair) for pair in pairs]
-        known = np.array([row is not None for row in rows], bool)
-        at = np.array([row for row in rows if row is not None], np.int64)
-        self._columns.measurements[at] = observations.measurements[known]
+        found = [self.row(*pair) for pair in observations.pairs.tolist()]
+        rows = np.array([-1 if row is None else row for row in found], np.int64)
+        self._columns.measurements[rows[rows >= 0]] = observations.measurements[rows >= 0]
 
     def remove(self, rows: Ints) -> None:
         """Remove rows; each must be in use."""

@@ -217,9 +217,8 @@ class LiveSystem(SlamSystem):
             self.catch_up()
 
     def _is_estimating(self, waiting: float) -> bool:
-        calibration = self.calibration
-        adopts = calibration is not None and calibration.adopts
-        return adopts and waiting < np.inf and calibration.busy
+        found = self.calibration
+        return found is not None and found.adopts and waiting < np.inf and found.busy
 
     def _is_behind(self, waiting: float) -> bool:
         is_full = waiting < np.inf and self.dense is not None and self.dense.full

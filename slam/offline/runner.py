@@ -228,7 +228,7 @@ def _system_maker(
         from bmask_slam.parallel.system import ParallelSystems  # noqa: PLC0415 - if asked for
 
         with closing(ParallelSystems(chosen, folder)) as systems:
-            yield systems, systems.memory
+            yield systems, systems.segmenter.memory if systems.segmenter else None
     elif options.localise:
         yield SlamSystem, None
     else:

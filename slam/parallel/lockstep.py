@@ -25,6 +25,7 @@ from bmask_slam.live.processes.map_worker import MapPlace, MapWorker
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.world_map import Keyframe, WorldMap
@@ -40,7 +41,7 @@ WAIT_S = 600.0
 class LockstepMapper(RemoteMapper):
     """A remote mapper whose answers are applied at frames that are the same in every run.
 
-    Once its process has died that is given up: the run goes on as a live one does.
+    Where its process has died they are waited for as well, but are not the same.
     """
 
     def __init__(
@@ -79,34 +80,32 @@ class LockstepMapper(RemoteMapper):
         Raises:
             InputError: one does not come.
         """
+        if self._finishes:
+            return super().catch_up(timeout_s)
         others, self._kept = self._kept, []
         until_s = time.monotonic() + WAIT_S
-        while self._handled < self._due and not self._goes_on_freely:
-            self._answers.extend(self.worker.receive(0.0 if self._answers else 0.1))
-            while self._answers and self._handled < self._due:
+        while self._handled < self._due and (self._answers or self._is_to_come()):
+            if self._answers:
                 others += self._apply_answers([self._answers.popleft()])
+                continue
+            self._answers.extend(self.worker.receive(0.1))
             if self.worker.has_crashed:
                 logger.warning("this run does not give the same bytes again")
                 self._answers.extend(self.worker.receive_last())
                 self.worker.restart()
-            elif time.monotonic() > until_s:
+            elif not self._answers and time.monotonic() > until_s:
                 raise InputError(f"the map's process has not answered for {WAIT_S:.0f} s")
-        if self._goes_on_freely:
-            others += self._apply_answers(list(self._answers))
-            self._answers.clear()
-            others += super().catch_up(timeout_s)
         return others
 
-    @property
-    def _goes_on_freely(self) -> bool:
-        """Whether answers are used as they come: at the end, or after the process has died."""
-        return self._finishes or self.worker.crashes > 0
+    def _is_to_come(self) -> bool:
+        """Whether something that is due will still be answered."""
+        return not self.worker.given_up and self.worker.lacks(self._handled, self._due)
 
     def _apply_answers(self, messages: list[Any]) -> list[Any]:
         others = []
         for message in messages:
             if isinstance(message, Handled):
-                self._handled = message.number
+                self._handled = max(message.number, self._handled)
             others += super()._apply_answers([message])
         return others
 
@@ -157,19 +156,22 @@ class LockstepMapper(RemoteMapper):
         return super().finish(timeout_s)
 
 
-class LockstepSegmenter:
+class LockstepSegmenter(RemoteSegmenter):
     """A remote segmenter whose masks are used at frames that are the same in every run.
 
     Attributes:
-        labels: classes of the segmenter. worker: its process.
+        memory: masks of images; those that it knows are not made again.
     """
 
-    def __init__(self, remote: RemoteSegmenter, memory: MaskMemory) -> None:
-        """Masks of images that the memory knows are not made again."""
-        self.labels, self.worker = remote.labels, remote.worker
-        self._remote, self._memory = remote, memory
+    def __init__(self, options: SegmenterOptions, sequence: Path) -> None:
+        super().__init__(options, sequence)
+        self.memory = MaskMemory()
+        self.begin()
+
+    def begin(self) -> None:
+        """The run begins, or begins anew."""
         self._frame = 0
-        self._requested: deque[tuple[int, ImageToSegment]] = deque()
+        self._images: deque[tuple[int, ImageToSegment]] = deque()  # of which masks will be used
         self._found: dict[int, Masks] = {}
 
     def begin_frame(self) -> None:
@@ -183,34 +185,31 @@ class LockstepSegmenter:
     @property
     def waiting(self) -> int:
         """Number of keyframes whose masks were not used yet."""
-        return len(self._requested)
+        return len(self._images)
 
     def awaits(self, keyframe_id: int) -> bool:
-        """Whether the masks of a keyframe will still be used."""
-        return any(image.keyframe_id == keyframe_id for _, image in self._requested)
+        """Whether the masks of a keyframe may still be used."""
+        return any(image.keyframe_id == keyframe_id for _, image in self._images)
 
     def request(self, image: ImageToSegment) -> None:
         """Request the masks of a keyframe; returns at once."""
-        self._requested.append((self._frame, image))
-        known = self._memory.recall(image.name)
+        self._images.append((self._frame, image))
+        known = self.memory.recall(image.name)
         if known is None:
-            self._remote.request(image)
+            super().request(image)
         else:
             self._found[image.keyframe_id] = Masks(image.keyframe_id, known)
 
     def receive_masks(self) -> list[Masks]:
         """The masks that are due, once they have come."""
         due = []
-        while self._requested and self._requested[0][0] <= self._frame - LAG:
-            _, image = self._requested.popleft()
-            while image.keyframe_id not in self._found and self._remote.awaits(image.keyframe_id):
-                self._found |= {masks.keyframe_id: masks for masks in self._remote.receive_masks()}
+        while self._images and self._images[0][0] <= self._frame - LAG:
+            _, image = self._images.popleft()
+            number = image.keyframe_id
+            while number not in self._found and super().awaits(number):
+                self._found |= {masks.keyframe_id: masks for masks in super().receive_masks()}
                 time.sleep(0.001)
-            if (masks := self._found.pop(image.keyframe_id, None)) is not None:
-                self._memory.keep(image.name, masks.instances)
+            if (masks := self._found.pop(number, None)) is not None:
+                self.memory.keep(image.name, masks.instances)
                 due.append(masks)
         return due
-
-    def close(self) -> None:
-        """Kill the process."""
-        self._remote.close()

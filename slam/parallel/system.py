@@ -13,11 +13,9 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import nested, part, read_arrays, write_arrays
-from bmask_slam.labelling.mask_memory import MaskMemory
 from bmask_slam.live.messages import STATE_FILE
 from bmask_slam.live.processes.map_process import LabelsOnly
 from bmask_slam.live.processes.map_worker import MapPlace
-from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.system import LiveSystem
 from bmask_slam.parallel.lockstep import LockstepMapper, LockstepSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
@@ -140,13 +138,12 @@ class ParallelSystems:
     """Makes the systems of a run; one that begins anew takes over the segmenter's process.
 
     Attributes:
-        memory: masks of the images that were segmented.
+        segmenter: None for a run without masks.
     """
 
     def __init__(self, masks: SegmenterOptions, sequence: Path) -> None:
         """Start the segmenter, for the images of a sequence. Raises InputError if it cannot."""
-        self.memory = MaskMemory()
-        self._remote = None if masks.name == "none" else RemoteSegmenter(masks, sequence)
+        self.segmenter = None if masks.name == "none" else LockstepSegmenter(masks, sequence)
         self._scratch = tempfile.TemporaryDirectory(
             prefix="bmask-slam-", ignore_cleanup_errors=True
         )
@@ -156,14 +153,15 @@ class ParallelSystems:
         """A new system; the one before is ended."""
         if self._last is not None:
             self._last.remote.close()
-        segmenter = LockstepSegmenter(self._remote, self.memory) if self._remote else None
-        self._last = ParallelSystem(camera, config, segmenter, Path(self._scratch.name))
+        if self.segmenter is not None:
+            self.segmenter.begin()
+        self._last = ParallelSystem(camera, config, self.segmenter, Path(self._scratch.name))
         return self._last
 
     def close(self) -> None:
         """End all processes."""
         if self._last is not None:
             self._last.close()
-        if self._remote is not None:
-            self._remote.close()
+        if self.segmenter is not None:
+            self.segmenter.close()
         self._scratch.cleanup()

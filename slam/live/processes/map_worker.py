@@ -52,6 +52,7 @@ class MapWorker:
         losses: how often the workstation was lost.
         state: the file of the last saved state, None before the first.
         saves: how many states were saved.
+        sent: the number of the last message.
     """
 
     def __init__(
@@ -77,7 +78,7 @@ class MapWorker:
         self._early: list[Any] = []
         self._standby: WorkerEnd | None = None  # in place of the workstation
         self._journal: dict[int, Any] = {}
-        self._number = 0
+        self.sent = 0
         self._crashes_in_a_row = 0
         self._is_ready = self._has_failed = False
         self._started = self._crashed_at = self._resent = 0  # numbers of messages
@@ -104,10 +105,9 @@ class MapWorker:
         """Process id."""
         return self._worker.pid
 
-    @property
-    def sent(self) -> int:
-        """The number of the last message."""
-        return self._number
+    def lacks(self, after: int, last: int) -> bool:
+        """Whether there are messages of these numbers that no saved state contains."""
+        return any(after < number <= last for number in self._journal)
 
     @property
     def given_up(self) -> bool:
@@ -124,9 +124,9 @@ class MapWorker:
         if isinstance(message, Finish) and self._return is not None:
             self._return.close()  # it ends where it is
             self._return = None
-        self._number += 1
-        self._journal[self._number] = message
-        self._worker.send((self._number, message))
+        self.sent += 1
+        self._journal[self.sent] = message
+        self._worker.send((self.sent, message))
 
     @property
     def has_crashed(self) -> bool:
@@ -150,8 +150,8 @@ class MapWorker:
         last = self._without_own(self._worker.receive())
         self._standby = Worker("map", STANDBY)
         self._worker, self._early = workstation, self._without_own(early)
-        self._resent = self._number
-        self._worker.send((0, Resent(self._number)))
+        self._resent = self.sent
+        self._worker.send((0, Resent(self.sent)))
         logger.warning("the workstation is back; the map's process is there again")
         self._send_journal(begin)
         return last
@@ -213,7 +213,7 @@ class MapWorker:
 
     def _send_again(self) -> None:
         """Start a process here and send it what no saved state contains."""
-        self._resent, self._has_failed = self._number, False
+        self._resent, self._has_failed = self.sent, False
         arguments = (*self._arguments, self.state, self._resent)
         if self._standby is not None:
             self._worker, self._standby = self._standby, None

@@ -18,12 +18,12 @@ from faults import children, wait_until
 from bmask_slam.config.configuration import from_tree
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import read_tum
-from bmask_slam.labelling.mask_memory import MaskMemory
-from bmask_slam.live.messages import ImageToSegment, Masks
+from bmask_slam.live.messages import ImageToSegment, Masks, Ready
+from bmask_slam.live.processes import segmentation
 from bmask_slam.offline.runner import RunOptions, resume, run
 from bmask_slam.parallel.lockstep import LAG, LockstepSegmenter
 from bmask_slam.parallel.system import ParallelSystem
-from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
@@ -122,32 +122,35 @@ def test_a_map_of_another_run_is_refused(slow_office: Path, whole: Path) -> None
         options(slow_office, whole, map=whole)
 
 
-class SlowSegmenter(SimpleNamespace):
-    """A segmenter whose masks are there once they were asked for often enough."""
+class SlowWorker(SimpleNamespace):
+    """A segmenter's process whose masks have come when they were asked for three times."""
 
-    def __init__(self) -> None:
-        super().__init__(labels=label_set(("cup",)), worker=None, asked={}, seen=[])
+    def __init__(self, *_: object) -> None:
+        super().__init__(asked={}, seen=[], given_up=False)
 
-    def request(self, image: ImageToSegment) -> None:
+    def wait_until_ready(self) -> Ready:
+        return Ready(("cup",))
+
+    def send(self, image: ImageToSegment, _: bool = False) -> None:
         self.asked[image.keyframe_id] = 3
         self.seen.append(image.name)
 
-    def awaits(self, number: int) -> bool:
-        return number in self.asked
-
-    def receive_masks(self) -> list[Masks]:
+    def receive(self) -> list[Masks]:
         self.asked = {number: left - 1 for number, left in self.asked.items()}
-        come = [number for number, left in self.asked.items() if left == 0]
-        for number in come:
-            del self.asked[number]
-        return [Masks(number, []) for number in come]
+        return [Masks(number, []) for number, left in self.asked.items() if left == 0]
+
+    def restart_if_needed(self, busy: bool) -> bool:
+        return False
 
 
-def test_masks_are_used_some_frames_later_and_made_once_an_image() -> None:
-    remote, memory = SlowSegmenter(), MaskMemory()
+def test_masks_are_used_some_frames_later_and_made_once_an_image(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(segmentation, "SupervisedWorker", SlowWorker)
+    segmenter = LockstepSegmenter(SegmenterOptions("light"), Path())
     image = np.zeros((2, 2, 3), np.uint8)
     for _ in range(2):  # the run begins anew
-        segmenter = LockstepSegmenter(remote, memory)
+        segmenter.begin()
         used = []
         for frame in range(8):
             segmenter.begin_frame()
@@ -156,7 +159,8 @@ def test_masks_are_used_some_frames_later_and_made_once_an_image() -> None:
                 segmenter.request(ImageToSegment(frame, image, f"{frame}.png"))
         assert used == [(LAG, 0), (LAG + 1, 1), (LAG + 4, 4)]
         assert segmenter.waiting == 0
-    assert remote.seen == ["0.png", "1.png", "4.png"]
+    assert segmenter.worker.seen == ["0.png", "1.png", "4.png"]
     segmenter.request(ImageToSegment(9, image, "9.png"))
+    assert segmenter.awaits(9)
     segmenter.use_all()
     assert [masks.keyframe_id for masks in segmenter.receive_masks()] == [9]
