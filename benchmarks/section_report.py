@@ -176,6 +176,7 @@ REPORTS = {
     "real-cameras": Report(RESULTS / "real-cameras.md", "Results: real cameras", {
         "table": ("Real sequences", "cameras.real_sequences --work {sequences}"),
         "reading": ("What the figures say", ""),
+        "parallel": ("In one process or three", ""),
         "hard": ("Hard inputs: never lost", ""),
         "loops": ("Loop closures", "loops.loop_edges --work {sequences}"),
         "wrong": ("Wrong cameras", "suite.wrong_cameras"),
