@@ -122,7 +122,8 @@ class LiveSystem(SlamSystem):
             return result
         if self.remote.world.in_segment(first.segment) == [first]:
             T_before = first.T_world_camera
-            self.remote.wait_for(first, FIRST_MAP_S)
+            for masks in self.remote.wait_for(first, FIRST_MAP_S):
+                self.moving_objects.observe_masks(masks)
             self._follow_map(first, T_before)
         return result
 

@@ -109,10 +109,11 @@ class LockstepMapper(RemoteMapper):
             others += super()._apply_answers([message])
         return others
 
-    def wait_for(self, keyframe: Keyframe, timeout_s: float) -> bool:
-        """Use all answers, so that a keyframe has its landmarks; whether it has."""
+    def wait_for(self, keyframe: Keyframe, timeout_s: float) -> list[Any]:
+        """Use all answers, so that a keyframe has its landmarks; returns as ``catch_up``."""
         self.use_all()
-        return len(self.world.observed(keyframe)[1]) > 0
+        others, self._kept = self._kept, []
+        return others
 
     def send_frames(self) -> None:
         """Tell the map of the frames since the last keyframe, if there are any."""

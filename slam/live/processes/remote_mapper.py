@@ -216,15 +216,15 @@ class RemoteMapper:
         """Wait until the process is ready. Raises InputError if it cannot start."""
         self.worker.wait_until_ready(timeout_s)
 
-    def wait_for(self, keyframe: Keyframe, timeout_s: float) -> bool:
-        """Wait until a keyframe has its landmarks; False after the timeout, or if it was lost."""
-        deadline_s = time.monotonic() + timeout_s
+    def wait_for(self, keyframe: Keyframe, timeout_s: float) -> list[Any]:
+        """Wait until a keyframe has landmarks, is lost, or the timeout; returns as ``catch_up``."""
+        others, deadline_s = [], time.monotonic() + timeout_s
         while len(self.world.observed(keyframe)[1]) == 0 and not self.given_up:
             left_s = deadline_s - time.monotonic()
             if left_s <= 0 or self.history.parent(keyframe.id)[0] == NO_KEYFRAME:
-                return False
-            self.catch_up(min(left_s, 0.05))
-        return True
+                break
+            others += self.catch_up(min(left_s, 0.05))
+        return others
 
     def finish(self, timeout_s: float) -> Path:
         """Let the process optimise a last time and save its state; returns the file's path.

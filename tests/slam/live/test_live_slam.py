@@ -10,6 +10,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import faiss
 import numpy as np
@@ -29,6 +30,7 @@ from bmask_slam.live.messages import NewKeyframe
 from bmask_slam.live.processes import worker
 from bmask_slam.live.processes.map_worker import MAX_CRASHES, MapWorker
 from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
+from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.run_folder.folder import HEALTH
@@ -285,3 +287,20 @@ def test_a_process_that_starts_too_late_is_reported(tmp_path, monkeypatch) -> No
     with pytest.raises(InputError, match="segmenter's process has not begun within 0 s"):
         RemoteSegmenter(SegmenterOptions("none"), tmp_path, policy=RestartPolicy(start_s=0.0))
     assert children() == before
+
+
+def test_masks_that_come_while_a_segment_begins_are_not_lost() -> None:
+    """Tracking waits for the first landmarks; masks of an older segment may come before them."""
+    landmarks: list[int] = []
+
+    def catch_up(_: float) -> list[str]:
+        landmarks.append(7)
+        return ["masks"]
+
+    mapper = SimpleNamespace(
+        world=SimpleNamespace(observed=lambda keyframe: (None, landmarks)),
+        history=SimpleNamespace(parent=lambda number: (number, np.eye(4))),
+        given_up=False,
+        catch_up=catch_up,
+    )
+    assert RemoteMapper.wait_for(mapper, SimpleNamespace(id=3), 60.0) == ["masks"]
