@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.back_end.config import BackEndConfig
 from bmask_slam.back_end.map_backend import MapBackend
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.back_end.marker_loops import join_by_markers
@@ -65,15 +64,10 @@ class SlamSystem(SensorSystem):
         self.config = config = config or SystemConfig()
         self.extractor = BriskExtractor(camera, config.features)
         tracker = Tracker(camera, config.tracking)
-        self.map = back_end or Mapper(camera, tracker, back_end_config(config))
+        self.map = back_end or Mapper(camera, tracker, config.back_end)
         self.events = self.map.events
-        self.camera_tracker = CameraTracker(
-            tracker,
-            self.map,
-            config.relocalisation,
-            config.mapping.local_map,
-            self.extractor,
-        )
+        rules = config.relocalisation, config.mapping.local_map
+        self.camera_tracker = CameraTracker(tracker, self.map, *rules, self.extractor)
         self.moving_objects = MovingObjectFilter(
             camera, config.moving_objects, config.features, self.map, self.camera_tracker
         )
@@ -150,12 +144,8 @@ class SlamSystem(SensorSystem):
 
     def state(self) -> Arrays:
         """All that the system has learned, as named arrays."""
-        reference = self.camera_tracker.reference
         return {
-            "segment": np.array(self.camera_tracker.segment),
-            "reference": np.array(-1 if reference is None else reference.id),
-            "frames_since_keyframe": np.array(self.keyframes.frames_since),
-            "first_keyframe": np.array(self._first_keyframe),
+            **self._progress(),
             **nested(
                 mapper=self.mapper.state(),
                 localiser=self.camera_tracker.state(),
@@ -172,6 +162,19 @@ class SlamSystem(SensorSystem):
             self.camera_tracker.restore(part(state, "localiser"))
             self.semantics.restore(part(state, "semantics"), path)
             self.moving_objects.restore(part(state, "dynamics"))
+        self._restore_progress(state)
+
+    def _progress(self) -> Arrays:
+        """Where in the map tracking is, and since when."""
+        reference = self.camera_tracker.reference
+        return {
+            "segment": np.array(self.camera_tracker.segment),
+            "reference": np.array(-1 if reference is None else reference.id),
+            "frames_since_keyframe": np.array(self.keyframes.frames_since),
+            "first_keyframe": np.array(self._first_keyframe),
+        }
+
+    def _restore_progress(self, state: Arrays) -> None:
         self.camera_tracker.segment = int(state["segment"])
         self.camera_tracker.reference = self.map.world.keyframes.get(int(state["reference"]))
         self.keyframes.frames_since = int(state["frames_since_keyframe"])
@@ -293,8 +296,3 @@ class SlamSystem(SensorSystem):
         poses = reference.T_world_camera, T_world_camera
         self.map.history.append(frame.timestamp_s, reference.id, *poses, tracked.information)
         return T_world_camera
-
-
-def back_end_config(config: SystemConfig) -> BackEndConfig:
-    """The settings of map and graph."""
-    return BackEndConfig(**{f.name: getattr(config, f.name) for f in fields(BackEndConfig)})

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
+from bmask_slam.back_end.config import BackEndConfig
 from bmask_slam.back_end.factor_selection import FactorSelectionConfig
 from bmask_slam.back_end.landmark_management import MappingConfig
 from bmask_slam.features.brisk import FeatureConfig
@@ -40,3 +41,8 @@ class SystemConfig:
     final_adjustment: bool = True
     smooth_trajectory: bool = True
     covariances: bool = False
+
+    @property
+    def back_end(self) -> BackEndConfig:
+        """The settings of map and graph."""
+        return BackEndConfig(**{f.name: getattr(self, f.name) for f in fields(BackEndConfig)})

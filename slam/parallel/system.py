@@ -6,8 +6,6 @@ import tempfile
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Arrays
@@ -76,13 +74,9 @@ class ParallelSystem(LiveSystem):
             self.remote.write_state(self._state_file)
             state = read_arrays(self._state_file, STATE_FILE)[1]
             self._whole, self._read = (self.remote.worker.sent, state), None
-        reference = self.camera_tracker.reference
         return {
             **self._whole[1],
-            "segment": np.array(self.camera_tracker.segment),
-            "reference": np.array(-1 if reference is None else reference.id),
-            "frames_since_keyframe": np.array(self.keyframes.frames_since),
-            "first_keyframe": np.array(self._first_keyframe),
+            **self._progress(),
             "mapper.events.now": self.events.state()["now"],
             **nested(localiser=self.camera_tracker.state(), dynamics=self.moving_objects.state()),
         }
@@ -93,9 +87,6 @@ class ParallelSystem(LiveSystem):
         self._begin_with(state)
         self.camera_tracker.restore(part(state, "localiser"))
         self.moving_objects.restore(part(state, "dynamics"))
-        self.camera_tracker.segment = int(state["segment"])
-        self.keyframes.frames_since = int(state["frames_since_keyframe"])
-        self._first_keyframe = int(state["first_keyframe"])
 
     def restart(self) -> None:
         """Go on with a new process and a new copy of the map, as a restored system does."""
@@ -107,7 +98,7 @@ class ParallelSystem(LiveSystem):
         self.remote.begin_with(self._state_file, state)
         now = {"now": state["mapper.events.now"]}
         self.events.restore({**self.events.state(), **now})
-        self.camera_tracker.reference = self.map.world.keyframes.get(int(state["reference"]))
+        self._restore_progress(state)  # the reference is of the new copy
         self._whole = self.remote.worker.sent, state
 
     def _offline(self, state: Arrays, path: Path | None = None) -> SlamSystem:

@@ -144,17 +144,22 @@ def test_a_worker_that_does_not_end_is_killed(caplog) -> None:
     assert "sleeper does not end; killed" in caplog.text
 
 
-def test_a_worker_does_not_import_from_the_current_folder(tmp_path, monkeypatch) -> None:
-    hostile = "from pathlib import Path; Path('ran').touch()"
-    (tmp_path / "queue.py").write_text(hostile)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)  # as ``python -m`` does
+def assert_echoes() -> None:
+    """A worker that is started now answers."""
     worker = Worker("echo", f"{HERE}:echo", "a")
     worker.send(1)
     try:
         assert answers(worker, 1) == [("a", 1)]
     finally:
         worker.kill()
+
+
+def test_a_worker_does_not_import_from_the_current_folder(tmp_path, monkeypatch) -> None:
+    hostile = "from pathlib import Path; Path('ran').touch()"
+    (tmp_path / "queue.py").write_text(hostile)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)  # as ``python -m`` does
+    assert_echoes()
     assert not (tmp_path / "ran").exists()
 
 
@@ -163,12 +168,7 @@ def test_a_worker_of_an_owner_whose_folder_was_removed(tmp_path, monkeypatch) ->
     folder.mkdir()
     monkeypatch.chdir(folder)
     folder.rmdir()
-    worker = Worker("echo", f"{HERE}:echo", "a")
-    worker.send(1)
-    try:
-        assert answers(worker, 1) == [("a", 1)]
-    finally:
-        worker.kill()
+    assert_echoes()
 
 
 @pytest.mark.skipif(not IS_SUPPORTED, reason="needs a server")
