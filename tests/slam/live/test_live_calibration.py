@@ -24,7 +24,9 @@ from bmask_slam.sequences.cameras import read_camera
 from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system_config import SystemConfig
 
-CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
+CONFIG = resolve(
+    SystemConfig, None, ("semantics.segmenter.name=none", "features.max_keypoints=400")
+)
 
 
 def played(sequence: Sequence, out: Path, calibrate: str) -> LiveSlam:

@@ -78,7 +78,7 @@ def test_the_address_shows_the_map_the_image_and_the_masks(tmp_path: Path) -> No
             browser.go(scene.url, *SIZE)
             end_s = time.monotonic() + DRAWN_S
             while min(shares) < 0.01 and time.monotonic() < end_s:
-                time.sleep(2)
+                time.sleep(0.5)
                 browser.screenshot(shot)
                 picture = cv2.cvtColor(cv2.imread(str(shot)), cv2.COLOR_BGR2RGB)
                 wanted = ((MAP, GREEN), (CAMERA, ORANGE), (KEYFRAME, BLUE))
