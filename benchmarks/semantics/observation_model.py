@@ -46,7 +46,8 @@ from bmask_slam.graph.data_files import data_path
 from bmask_slam.semantics.beliefs.class_sizes import SUPPORT, read_sizes
 from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
 from bmask_slam.semantics.beliefs.observation import DISTANCE_STEP
-from bmask_slam.semantics.beliefs.votes import VoteConfig, assign_pixels
+from bmask_slam.semantics.beliefs.pixel_assignment import assign_pixels
+from bmask_slam.semantics.beliefs.vote_config import VoteConfig
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import Segmenter

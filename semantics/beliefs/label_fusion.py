@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import betaln
 
-from bmask_slam.graph.arrays import Array, Floats
+from bmask_slam.graph.arrays import Array, Floats, Ints
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,12 @@ class LabelStoreConfig:
         prior = self.prior(distributions.shape[1]).astype(np.float32)
         return weights[:, None] * distributions / prior + (1 - weights[:, None])
 
+    def log_likelihoods(self, distributions: Floats, weights: Floats) -> Floats:
+        """Their logarithms (N, C) times ``power``, bounded by ``max_log_odds``."""
+        floor = np.float32(np.exp(-self.max_log_odds))
+        likelihood = np.maximum(self.likelihoods(distributions, weights), floor)
+        return np.float32(self.power) * np.log(likelihood)
+
     def log_missed(self, misses: Floats, recall: Array | None = None) -> Array:
         """log P(m misses (...) | a known class); m is the sum of the views' weights.
 
@@ -80,3 +87,18 @@ class LabelStoreConfig:
         if recall is not None:
             a, b = recall * (a + b), (1 - recall) * (a + b)
         return np.asarray(betaln(a, b + misses.astype(float)) - betaln(a, b))
+
+
+def in_turn(ids: Ints) -> Iterator[Ints]:
+    """Rows of ids (N,) which may repeat: all first ones, all second ones and so on.
+
+    In each part all ids differ, so views of many things are fused at once, and those of one thing
+    one after another.
+    """
+    order = np.argsort(ids, kind="stable")
+    begins = np.flatnonzero(np.diff(ids[order], prepend=-1))
+    turn = np.empty(len(ids), np.int64)
+    turn[order] = np.arange(len(ids)) - np.repeat(begins, np.diff(begins, append=len(ids)))
+    by_turn = np.argsort(turn, kind="stable")
+    if len(ids):
+        yield from np.split(by_turn, np.cumsum(np.bincount(turn))[:-1])

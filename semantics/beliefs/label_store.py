@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask
 from bmask_slam.graph.files.array_file import check_ids
 from bmask_slam.semantics.beliefs.class_sizes import ANY, SUPPORT, TOP
-from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
+from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig, in_turn
 from bmask_slam.semantics.beliefs.observation import GROUPS, ObservationModel, score_logits
 
 _MIN_CAPACITY = 1024
+_VIEWPOINTS = 64
+_TABLES = ("_log_p", "_views", "_misses", "_scores", "_seen", "_judged")
 
 
 @dataclass(frozen=True)
@@ -57,41 +59,57 @@ class LabelStore:
     def update(
         self, ids: Ints, distributions: Floats, weights: Floats, viewpoints: Ints | None = None
     ) -> None:
-        """Fuse views of ids (N,), which may repeat.
+        """``fuse`` views (N,) that masks cover, with distributions (N, C) and weights (N,)."""
+        none = np.zeros((0, 1), np.float32)
+        self.fuse(ids, np.zeros(len(ids), bool), (distributions, weights), none, viewpoints)
 
-        Each view is a distribution (N, C) that is right with probability weight (N,) and
-        uninformative otherwise; ``viewpoints`` (N,) below 64 say from where.
+    def miss(self, ids: Ints, weights: Floats, viewpoints: Ints | None = None) -> None:
+        """``fuse`` views (N,) that no mask covers, with weights (N,) or (N, GROUPS)."""
+        none = np.zeros((0, self.classes), np.float32), np.zeros(0, np.float32)
+        if len(ids):
+            misses = weights.reshape(len(ids), -1)
+            self.fuse(ids, np.ones(len(ids), bool), none, misses, viewpoints)
+
+    def fuse(
+        self,
+        ids: Ints,
+        missed: Mask,
+        told: tuple[Floats, Floats],
+        misses: Floats,
+        viewpoints: Ints | None = None,
+    ) -> None:
+        """Fuse views of ids (N,), one after another where these repeat.
+
+        Where a view is not ``missed`` (N,), masks ``told`` a distribution (M, C) that is right with
+        probability weight (M,) and uninformative otherwise. Where it is, no mask covers the thing:
+        ``misses`` (N - M, GROUPS or 1) are weights, for each group of classes of like size.
+        ``viewpoints`` (N,) below 64 say from where.
         """
         if not len(ids):
             return
         self._reserve(int(ids.max()) + 1)
         new = self._novelty(ids, viewpoints)
-        likelihood = self.config.likelihoods(distributions, weights)
-        floor = np.float32(np.exp(-self.config.max_log_odds))
-        gained = np.float32(self.config.power) * np.log(np.maximum(likelihood, floor))
-        gained *= new[:, None]
-        if self.model is not None and not self._of_objects:
-            self._limit_supports(ids, distributions, gained)
-        self._add(ids, gained, np.ones(len(ids), np.int32))
+        np.add.at(self._views, ids, 1)
+        added = np.zeros((len(ids), self._misses.shape[1]), np.float32)
+        added[missed] = misses * new[missed, None]
+        worth = np.where(missed[:, None], added, new[:, None])
+        kept = 1 - worth / np.float32(self.config.recall_views)
+        for rows in in_turn(ids):
+            at = ids[rows]
+            self._misses[at] = self._misses[at] * kept[rows] + added[rows]
+        self._fuse_masks(ids[~missed], *told, new[~missed])
+
+    def _fuse_masks(self, ids: Ints, distributions: Floats, weights: Floats, new: Floats) -> None:
+        """Fuse what masks tell of ids (N,), by how ``new`` (N,) their viewpoints are."""
+        gained = self.config.log_likelihoods(distributions, weights) * new[:, None]
         worth = weights * new
         scored = np.stack([worth * score_logits(distributions), worth], axis=1)
         np.add.at(self._scores, ids, scored)
-        kept = (1 - new / np.float32(self.config.recall_views))[:, None]
-        np.multiply.at(self._misses, ids, kept)
-
-    def miss(self, ids: Ints, weights: Floats, viewpoints: Ints | None = None) -> None:
-        """Count views of ids (N,), which may repeat, that no mask covers.
-
-        Weights (N,) or, for each group of classes of like size, (N, GROUPS).
-        """
-        if len(ids):
-            self._reserve(int(ids.max()) + 1)
-            worth = weights.reshape(len(ids), -1) * self._novelty(ids, viewpoints)[:, None]
-            worth = np.broadcast_to(worth, (len(ids), self._misses.shape[1]))
-            kept = (1 - worth / np.float32(self.config.recall_views)).astype(np.float32)
-            np.multiply.at(self._misses, ids, kept)
-            np.add.at(self._misses, ids, worth.astype(np.float32))
-            np.add.at(self._views, ids, 1)
+        limited = self.model is not None and not self._of_objects
+        for rows in in_turn(ids):
+            at, part = ids[rows], gained[rows]
+            self._log_p[at] += self._limited(at, distributions[rows], part) if limited else part
+            self._bound(at)
 
     def move(self, from_ids: Ints, to_ids: Ints) -> None:
         """Add all views of from_ids (N,) to those of to_ids (N,): each pair is one thing."""
@@ -101,7 +119,9 @@ class LabelStore:
         gained, views = self._log_p[from_ids], self._views[from_ids]
         misses, scores, seen = (t[from_ids] for t in (self._misses, self._scores, self._seen))
         self._reset(from_ids)
-        self._add(to_ids, gained, views)
+        np.add.at(self._log_p, to_ids, gained)
+        self._bound(to_ids)
+        np.add.at(self._views, to_ids, views)
         np.add.at(self._misses, to_ids, misses)
         np.add.at(self._scores, to_ids, scores)
         np.bitwise_or.at(self._seen, to_ids, seen)
@@ -207,13 +227,7 @@ class LabelStore:
         self._limit_misses(ids)
         self._resize(len(self))
 
-    def _add(self, ids: Ints, gained: Floats, views: NDArray[np.int32]) -> None:
-        if len(np.unique(ids)) == len(ids):
-            self._log_p[ids] += gained
-            self._views[ids] += views
-        else:
-            np.add.at(self._log_p, ids, gained)
-            np.add.at(self._views, ids, views)
+    def _bound(self, ids: Ints) -> None:
         log_p = self._log_p[ids]
         log_p -= log_p.max(axis=1, keepdims=True)
         self._log_p[ids] = np.maximum(log_p, np.float32(-self.config.max_log_odds))
@@ -224,11 +238,14 @@ class LabelStore:
             return np.ones(len(ids), np.float32)
         bits = np.left_shift(np.uint64(1), viewpoints.astype(np.uint64))
         known = (self._seen[ids] & bits) > 0
+        again = np.ones(len(ids), bool)
+        again[np.unique(ids * _VIEWPOINTS + viewpoints, return_index=True)[1]] = False
+        known |= again
         np.bitwise_or.at(self._seen, ids, bits)
         return np.where(known, np.float32(self.config.again), np.float32(1))
 
-    def _limit_supports(self, ids: Ints, distributions: Floats, gained: Floats) -> None:
-        """Limit what masks of supports add (N, C) to ids (N,), in place.
+    def _limited(self, ids: Ints, distributions: Floats, gained: Floats) -> Floats:
+        """What masks add (N, C) to ids (N,), of supports only so much.
 
         Nothing is taken from what may lie on them.
         """
@@ -244,15 +261,15 @@ class LabelStore:
         at = np.ix_(rows, small)
         gained[at] = np.maximum(gained[at], nothing[:, None])
         gained[rows, k] = np.minimum(own, nothing + room)
+        return gained
 
     def _limit_misses(self, ids: Ints) -> None:
         limit = np.float32(self.config.recall_views)
         self._misses[ids] = np.minimum(self._misses[ids], limit)
 
     def _reset(self, ids: Ints) -> None:
-        for table in (self._log_p, self._views, self._misses, self._scores):
-            table[ids] = 0
-        self._seen[ids] = self._judged[ids] = 0
+        for name in _TABLES:
+            getattr(self, name)[ids] = 0
 
     def _clear(self) -> None:
         self._log_p: Floats = np.zeros((_MIN_CAPACITY, self.classes), np.float32)
@@ -271,12 +288,8 @@ class LabelStore:
         """Set the capacity to the next power of two: a function of the size alone."""
         capacity = max(_MIN_CAPACITY, 1 << max(size - 1, 0).bit_length())
         if len(self._views) != capacity:
-            self._log_p = _resized(self._log_p, capacity)
-            self._views = _resized(self._views, capacity)
-            self._misses = _resized(self._misses, capacity)
-            self._scores = _resized(self._scores, capacity)
-            self._seen = _resized(self._seen, capacity)
-            self._judged = _resized(self._judged, capacity)
+            for name in _TABLES:
+                setattr(self, name, _resized(getattr(self, name), capacity))
 
 
 def _resized(table: NDArray[Any], rows: int) -> NDArray[Any]:

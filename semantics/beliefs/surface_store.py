@@ -8,6 +8,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
 from bmask_slam.graph.files.array_file import check_ids
+from bmask_slam.semantics.beliefs.label_fusion import in_turn
 from bmask_slam.semantics.labels import LabelSet, label_set
 
 CORRELATION = 0.6
@@ -88,9 +89,9 @@ class SurfaceStore:
         self._views = np.zeros(0, np.int32)
 
     def update(self, names: LabelSet, ids: Ints, probabilities: Floats) -> None:
-        """Add a view of ids (N,), all different, with distributions (N, C).
+        """Add views of ids (N,), which may repeat, with distributions (N, C).
 
-        A view with another label set than the first one's is not used.
+        Views with another label set than the first ones' are not used.
         """
         if len(self.names) == 1:
             self.names = names
@@ -98,8 +99,10 @@ class SurfaceStore:
         if names != self.names or not len(ids):
             return
         self._reserve(int(ids.max()) + 1)
-        self._log_sums[ids] += log_view(probabilities)
-        self._views[ids] += 1
+        gained = log_view(probabilities)
+        for rows in in_turn(ids):
+            self._log_sums[ids[rows]] += gained[rows]
+        np.add.at(self._views, ids, 1)
 
     def move(self, from_ids: Ints, to_ids: Ints) -> None:
         """Add all views of from_ids (N,) to those of to_ids (N,): each pair is one thing."""

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Bytes, Floats
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.labels import LabelSet
 
+Codes = NDArray[np.uint16]
 LEVELS = 255
 """Of a probability in the 16 bits of a code; the class is above it."""
 
@@ -55,7 +57,7 @@ class SurfaceClasses:
         missing = [(0, n - m) for n, m in zip(self.size, found.shape[:2], strict=True)]
         return np.pad(found, (*missing, (0, 0)), "edge") if np.any(missing) else found
 
-    def codes(self) -> Array:
+    def codes(self) -> Codes:
         """(h, w) uint16: the likeliest label times 256 plus its probability in 255ths."""
         best = self.probabilities.max(axis=2).astype(np.float32)
         label = self.probabilities.argmax(axis=2) + 1
@@ -63,7 +65,7 @@ class SurfaceClasses:
 
     @classmethod
     def from_codes(
-        cls, codes: Array, labels: LabelSet, cell_px: float, size: tuple[int, int]
+        cls, codes: Codes, labels: LabelSet, cell_px: float, size: tuple[int, int]
     ) -> SurfaceClasses:
         """The inverse of ``codes``: what is not the likeliest class's is shared by the others."""
         label, best = codes // (LEVELS + 1), (codes % (LEVELS + 1)) / LEVELS
@@ -80,15 +82,19 @@ class CodedSurfaces:
     """What is kept of ``SurfaceClasses``: ``codes`` (h, w) of its cells of ``cell_px``."""
 
     labels: LabelSet
-    codes: Array
+    codes: Codes
     cell_px: float
 
-    def at(self, pixels: Array) -> Floats:
-        """Probabilities (N, C) at pixels (N, 2), of the cells that they are in."""
+    def codes_at(self, pixels: Array) -> Codes:
+        """Codes (N,) of the cells that pixels (N, 2) are in."""
         limits = np.array(self.codes.shape[::-1]) - 1
         columns, rows = np.clip(((pixels + 0.5) / self.cell_px).astype(np.int64), 0, limits).T
-        codes = self.codes[rows, columns][:, None]
-        cells = SurfaceClasses.from_codes(codes, self.labels, self.cell_px, codes.shape)
+        return self.codes[rows, columns]
+
+    @staticmethod
+    def decoded(codes: Codes, labels: LabelSet) -> Floats:
+        """Probabilities (N, C) of codes (N,)."""
+        cells = SurfaceClasses.from_codes(codes[:, None], labels, 1.0, (len(codes), 1))
         return cells.probabilities[:, 0].astype(np.float32)
 
 

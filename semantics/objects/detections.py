@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
-from bmask_slam.semantics.beliefs.votes import NO_INSTANCE, PixelAssignment
+from bmask_slam.semantics.beliefs.pixel_assignment import NO_INSTANCE, PixelAssignment
 
 _COARSE = 4
 """Overlaps of masks are counted on every fourth pixel in both directions."""

@@ -14,8 +14,8 @@ from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.semantics.beliefs.class_sizes import ClassSizes
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.observation import viewpoint_cells
+from bmask_slam.semantics.beliefs.pixel_assignment import NO_INSTANCE, PixelAssignment
 from bmask_slam.semantics.beliefs.surface_geometry import Ground
-from bmask_slam.semantics.beliefs.votes import NO_INSTANCE, PixelAssignment
 from bmask_slam.semantics.objects.association import (
     Evidence,
     Overlap,

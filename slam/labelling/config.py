@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
-from bmask_slam.semantics.beliefs.votes import VoteConfig
+from bmask_slam.semantics.beliefs.vote_config import VoteConfig
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.objects.config import ObjectConfig
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +34,11 @@ class Observed:
     def T_world_camera(self) -> Array:
         return self.anchor.T_world_camera @ self.T_anchor_camera
 
+    def among(self, selected: Mask) -> Observed:
+        """Those of ``selected``, a mask over all landmarks."""
+        keep = selected[self.landmark_ids]
+        return replace(self, pixels=self.pixels[keep], landmark_ids=self.landmark_ids[keep])
+
     def located(self, world: WorldMap) -> VisibleLandmarks:
         """Its landmarks, with their depths at the present pose."""
         T_world_camera = self.T_world_camera
@@ -56,46 +62,99 @@ class VisibleLandmarks:
     T_world_camera: Array
     segment: int
 
-    def among(self, selected: Mask) -> VisibleLandmarks:
-        """Those that are ``wanted``, a mask over all landmarks."""
-        keep = selected[self.landmark_ids]
-        kept = self.pixels[keep], self.z_m[keep], self.landmark_ids[keep]
-        return VisibleLandmarks(*kept, self.T_world_camera, self.segment)
-
-    def with_visible(
-        self, depth_m: Floats, camera: Camera, world: WorldMap, selected: Mask | None = None
-    ) -> VisibleLandmarks:
-        """These and others of the segment on the surface that the keyframe's depth image shows.
-
-        The nearest nine of ``depth_m`` (H / s, W / s), every s-th pixel of the depth image, are
-        compared: at the border of an object, where many landmarks are, colour and depth disagree by
-        a pixel or two. ``wanted`` is a mask over all landmarks; without it all in the map are used.
-        """
-        landmarks = world.landmarks
-        others = (landmarks.in_map if selected is None else selected).copy()
-        others[self.landmark_ids] = False
-        ids = np.flatnonzero(others)
-        hosts = [k.id for k in world.in_segment(self.segment)]
-        ids = ids[np.isin(landmarks.host[ids], hosts)]
-        local = transform(inverse(self.T_world_camera), landmarks.points_world[ids])
-        ahead = np.flatnonzero(local[:, 2] > 0.1)
-        pixels = camera.project_distorted(local[ahead])
-        whole = np.rint(pixels)
-        inside = ((whole >= 0) & (whole < [camera.width, camera.height])).all(axis=1)
-        rows, pixels = ahead[inside], pixels[inside]
-        step = camera.height // depth_m.shape[0]
-        limits = np.array(depth_m.shape) - 1
-        nearest = whole[inside, ::-1].astype(np.int64) // step
-        v, u = np.moveaxis(np.clip(nearest[:, None] + _NINE, 0, limits), -1, 0)
-        z_m = local[rows, 2]
-        on_surface = (np.abs(depth_m[v, u] - z_m[:, None]) < _REACH * z_m[:, None]).any(axis=1)
+    def with_visible(self, depth_m: Floats, camera: Camera, world: WorldMap) -> VisibleLandmarks:
+        """These and all ``visible_landmarks`` of the map."""
+        found = visible_landmarks(
+            Views(self.T_world_camera[None], np.array([self.segment]), depth_m[None]),
+            camera,
+            world,
+            world.landmarks.in_map,
+            (np.zeros(len(self.landmark_ids), np.int64), self.landmark_ids),
+        )
         return VisibleLandmarks(
-            np.concatenate([self.pixels, pixels[on_surface]]),
-            np.concatenate([self.z_m, z_m[on_surface]]),
-            np.concatenate([self.landmark_ids, ids[rows[on_surface]]]),
+            np.concatenate([self.pixels, found.pixels]),
+            np.concatenate([self.z_m, found.z_m]),
+            np.concatenate([self.landmark_ids, found.landmark_ids]),
             self.T_world_camera,
             self.segment,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """V keyframes at poses (V, 4, 4) in map segments (V,), with depth images in m.
+
+    Of the latter every s-th pixel each way: (V, H / s, W / s).
+    """
+
+    T_world_camera: Array
+    segments: Ints
+    depth_m: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Landmarks (N,) in images of views (N,), at pixels (N, 2) and depths (N,) in m."""
+
+    views: Ints
+    landmark_ids: Ints
+    pixels: Array
+    z_m: Array
+
+    def select(self, rows: Ints) -> Sightings:
+        """Some of them, in the order of ``rows``."""
+        return Sightings(
+            self.views[rows], self.landmark_ids[rows], self.pixels[rows], self.z_m[rows]
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Sightings]) -> Sightings:
+        """All of several, one after another."""
+        nothing = np.zeros(0, np.int64)
+        return cls(
+            np.concatenate([nothing, *(p.views for p in parts)]),
+            np.concatenate([nothing, *(p.landmark_ids for p in parts)]),
+            np.concatenate([np.zeros((0, 2)), *(p.pixels for p in parts)]),
+            np.concatenate([np.zeros(0), *(p.z_m for p in parts)]),
+        )
+
+
+def visible_landmarks(
+    seen_from: Views,
+    camera: Camera,
+    world: WorldMap,
+    selected: Mask,
+    known: tuple[Ints, Ints],
+) -> Sightings:
+    """Landmarks of a view's segment on the surface that its depth image shows.
+
+    The nearest nine of its pixels are compared: at the border of an object, where many landmarks
+    are, colour and depth disagree by a pixel or two. ``selected`` is a mask over all landmarks;
+    ``known`` are views (N,) and landmarks (N,) which are left out. The result is in the order of
+    views, and of landmarks within one.
+    """
+    landmarks = world.landmarks
+    ids = np.flatnonzero(selected)
+    wanted = np.zeros((len(seen_from.segments), len(ids)), bool)
+    for segment in np.unique(seen_from.segments).tolist():
+        hosts = [k.id for k in world.in_segment(segment)]
+        wanted[seen_from.segments == segment] = np.isin(landmarks.host[ids], hosts)
+    there = selected[known[1]]
+    wanted[known[0][there], np.searchsorted(ids, known[1][there])] = False
+    local = transform(inverse(seen_from.T_world_camera), landmarks.points_world[ids])
+    views, rows = np.nonzero(wanted & (local[..., 2] > 0.1))
+    pixels = camera.project_distorted(local[views, rows])
+    whole = np.rint(pixels)
+    inside = ((whole >= 0) & (whole < [camera.width, camera.height])).all(axis=1)
+    views, rows, pixels = views[inside], rows[inside], pixels[inside]
+    size = seen_from.depth_m.shape[1:]
+    nearest = whole[inside, ::-1].astype(np.int64) // (camera.height // size[0])
+    v, u = np.moveaxis(np.clip(nearest[:, None] + _NINE, 0, np.array(size) - 1), -1, 0)
+    z_m = local[views, rows, 2]
+    apart_m = np.abs(seen_from.depth_m[views[:, None], v, u] - z_m[:, None])
+    on_surface = (apart_m < _REACH * z_m[:, None]).any(axis=1)
+    views, rows = views[on_surface], rows[on_surface]
+    return Sightings(views, ids[rows], pixels[on_surface], z_m[on_surface])
 
 
 def observed_by(keyframe_id: int, map_reader: MapReader) -> Observed | None:

@@ -2,52 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Arrays, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.labelling.landmark_visibility import Observed, VisibleLandmarks, observed_by
+from bmask_slam.labelling.landmark_visibility import (
+    Observed,
+    Sightings,
+    Views,
+    observed_by,
+    visible_landmarks,
+)
+from bmask_slam.labelling.remembered_masks import RememberedMasks
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.observation import viewpoint_cells
+from bmask_slam.semantics.beliefs.pixel_assignment import PixelAssignment
 from bmask_slam.semantics.beliefs.surface_geometry import by_height
 from bmask_slam.semantics.beliefs.surface_store import (
     SurfaceEstimates,
     SurfaceStore,
     with_things,
 )
-from bmask_slam.semantics.beliefs.votes import PixelAssignment, VoteConfig, vote
-from bmask_slam.semantics.instances.instances import Instance
-from bmask_slam.semantics.instances.surfaces import CodedSurfaces, SurfaceClasses, coded
+from bmask_slam.semantics.beliefs.vote_config import VoteConfig
+from bmask_slam.semantics.beliefs.votes import PixelStack, vote_in_views
+from bmask_slam.semantics.instances.surfaces import SurfaceClasses
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.world.map_editor import MapReader
 
-REMEMBERED = 100
-"""Number of keyframes whose masks vote on landmarks that are made later."""
-THINNED = 4
-"""Of their masks and depth images every so many pixels are kept each way."""
-_NO_MASK = np.zeros((0, 0), bool)
-
-
-@dataclass(frozen=True, eq=False)
-class _Remembered:
-    """What a keyframe's masks say, and the classes of all its pixels, if it has them."""
-
-    assignment: PixelAssignment
-    surfaces: SurfaceClasses | CodedSurfaces | None
+_NOWHERE = -1
+"""Segment of a keyframe that has left the map."""
 
 
 class LabelVotes:
     """Votes of masks on landmarks, for the stores of labels and of surfaces.
 
     A landmark is often made later than the keyframes that see its place best: in a room that is
-    seen again, most are. The masks of the last REMEMBERED keyframes therefore vote on new landmarks
-    too, at the places where they would have been.
+    seen again, most are. The masks of the last keyframes therefore vote on new landmarks too, at
+    the places where they would have been.
     """
-
-    _remembered: dict[int, _Remembered]
 
     def __init__(
         self,
@@ -59,7 +53,7 @@ class LabelVotes:
     ) -> None:
         self._camera, self._config, self._map = camera, config, map_reader
         self._labels, self._surfaces = labels, surfaces
-        self._remembered = {}
+        self._remembered = RememberedMasks(labels.classes)
 
     def vote(
         self,
@@ -75,40 +69,72 @@ class LabelVotes:
         world = self._map.world
         new = world.landmarks.in_map.copy()
         new[self._labels.known()] = False
-        for earlier_id, earlier in self._remembered.items() if new.any() else ():
-            visible = observed_by(earlier_id, self._map)
-            if visible is not None:
-                matched = visible.located(world).among(new)
-                depth_m = earlier.assignment.depth_m
-                located = matched.with_visible(depth_m, self._camera, world, new)
-                self._vote(earlier, located)
-        located = observed.located(world).with_visible(assignment.depth_m, self._camera, world)
-        ids = self._vote(_Remembered(assignment, seen), located)
-        codes = None if seen is None else coded(seen)
-        self._remembered[keyframe_id] = _Remembered(_thinned(assignment), codes)
-        if len(self._remembered) > REMEMBERED:
-            del self._remembered[min(self._remembered)]
+        if new.any():
+            self._vote_on_new(new)
+        here = observed.located(world).with_visible(assignment.depth_m, self._camera, world)
+        views = np.zeros(len(here.landmark_ids), np.int64)
+        sightings = Sightings(views, here.landmark_ids, here.pixels, here.z_m)
+        stack = PixelStack.of(assignment, self._labels.classes)
+        ids = self._vote(stack, sightings, here.T_world_camera[None])
+        if seen is not None and len(here.landmark_ids):
+            self._surfaces.update(seen.labels, here.landmark_ids, seen.at(here.pixels))
+        self._remembered.add(keyframe_id, assignment, seen)
         return ids
 
-    def _vote(self, view: _Remembered, visible: VisibleLandmarks) -> Ints:
-        if not len(visible.landmark_ids):
-            return visible.landmark_ids
-        store, scale = self._labels, self._camera.width // view.assignment.owner.shape[1]
+    def _vote_on_new(self, new: Mask) -> None:
+        """Let the masks of earlier keyframes vote on landmarks, a mask over all, made since."""
+        rows = np.array(list(self._remembered.rows.values()), np.int64)
+        if not len(rows):
+            return
+        stack, world = self._remembered.stack(), self._map.world
+        poses, segments = np.tile(np.eye(4), (len(rows), 1, 1)), np.full(len(rows), _NOWHERE)
+        matched = []
+        for keyframe_id, row in self._remembered.rows.items():
+            if (seen := observed_by(keyframe_id, self._map)) is None:
+                continue
+            located = seen.among(new).located(world)
+            poses[row], segments[row] = located.T_world_camera, located.segment
+            of_row = np.full(len(located.landmark_ids), row)
+            matched.append(Sightings(of_row, located.landmark_ids, located.pixels, located.z_m))
+        known = Sightings.joined(matched)
+        others = visible_landmarks(
+            Views(poses, segments, stack.depth_m),
+            self._camera,
+            world,
+            new,
+            (known.views, known.landmark_ids),
+        )
+        turn = np.empty(len(rows), np.int64)
+        turn[rows] = np.arange(len(rows))
+        sightings = Sightings.joined([known, others])
+        sightings = sightings.select(np.argsort(turn[sightings.views], kind="stable"))
+        self._vote(stack, sightings, poses)
+        parts = self._remembered.surfaces_at(sightings.views, sightings.pixels)
+        for labels, numbers, probabilities in parts:
+            self._surfaces.update(labels, sightings.landmark_ids[numbers], probabilities)
+
+    def _vote(self, stack: PixelStack, sightings: Sightings, T_world_camera: Array) -> Ints:
+        """Let views at poses (V, 4, 4) vote on landmarks, one after another.
+
+        Returns the ids (N,) of those on which they did.
+        """
+        camera, store = self._camera, self._labels
+        if not len(sightings.landmark_ids):
+            return sightings.landmark_ids
+        scale = camera.width // stack.owner.shape[2]
         config = replace(self._config, edge_px=-(-self._config.edge_px // scale))
-        pixels = visible.pixels / scale
-        votes = vote(view.assignment, pixels, visible.z_m, store.classes, config)
-        ids, hit = visible.landmark_ids[votes.rows], ~votes.missed
-        points_world = self._map.world.landmarks.points_world[ids]
-        cells = viewpoint_cells(points_world, visible.T_world_camera[:3, 3])
-        store.update(ids[hit], votes.distributions[hit], votes.weights[hit], cells[hit])
-        missed = votes.weights[~hit]
+        pixels, z_m = sightings.pixels / scale, sightings.z_m
+        votes = vote_in_views(stack, sightings.views, pixels, z_m, config)
+        rows, missed = votes.rows, votes.missed
+        ids = sightings.landmark_ids[rows]
+        positions = T_world_camera[sightings.views[rows], :3, 3]
+        cells = viewpoint_cells(self._map.world.landmarks.points_world[ids], positions)
+        misses = votes.weights[missed, None]
         if store.model is not None:
-            z_m, camera = visible.z_m[votes.rows[~hit]], self._camera
-            expected = store.model.group_recall(z_m, camera.fx, camera.width)
-            missed = (missed[:, None] * expected).astype(np.float32)
-        store.miss(ids[~hit], missed, cells[~hit])
-        if (seen := view.surfaces) is not None:
-            self._surfaces.update(seen.labels, visible.landmark_ids, seen.at(visible.pixels))
+            expected = store.model.group_recall(z_m[rows[missed]], camera.fx, camera.width)
+            misses = (misses * expected).astype(np.float32)
+        told = votes.distributions[~missed], votes.weights[~missed]
+        store.fuse(ids, missed, told, misses, cells)
         return ids
 
     def surfaces(
@@ -128,89 +154,9 @@ class LabelVotes:
 
     def state(self) -> Arrays:
         """The masks of the last keyframes, as named arrays."""
-        views = [v.assignment for v in self._remembered.values()]
-        instances = [i for c in views for i in c.instances]
-        return {
-            "keyframes": np.array(list(self._remembered), np.int64),
-            "shape": np.array([v.owner.shape for v in views], np.int64).ravel(),
-            "depth_shape": np.array([v.depth_m.shape for v in views], np.int64).ravel(),
-            "owner": np.array([v.owner for v in views], np.int16).ravel(),
-            "under": np.array([v.under for v in views], np.int16).ravel(),
-            "inner": np.array([v.inner for v in views], bool).ravel(),
-            "depth_m": np.array([v.depth_m for v in views], np.float32).ravel(),
-            "ranges_m": np.concatenate([np.zeros(0), *(v.depth_range_m.ravel() for v in views)]),
-            "counts": np.array([len(v.instances) for v in views], np.int64),
-            "boxes": np.array([i.box for i in instances], np.float32).ravel(),
-            "labels": np.array([i.label for i in instances], np.int64),
-            "distributions": np.array([i.distribution for i in instances], np.float32).ravel(),
-            "scores": np.array([(i.class_score, i.mask_score) for i in instances], float).ravel(),
-            **_surface_arrays(self._surfaces.names, list(self._remembered.values())),
-        }
+        return self._remembered.state(self._surfaces.names)
 
     def restore(self, state: Arrays) -> None:
         """Go on from a state."""
-        count = len(state["keyframes"])
-        shape, depth_shape = (state[n][:2].tolist() for n in ("shape", "depth_shape"))
-        images = {n: state[n].reshape(count, *shape) for n in ("owner", "under", "inner")}
-        depths_m = state["depth_m"].reshape(count, *depth_shape)
-        ranges_m = state["ranges_m"].reshape(-1, 2)
-        instances, ends = _instances(state), np.cumsum(state["counts"])
-        surfaces = _restored_surfaces(self._surfaces.names, state, count)
-        self._remembered = {}
-        for k, keyframe_id in enumerate(state["keyframes"].tolist()):
-            rows = slice(ends[k] - state["counts"][k], ends[k])
-            owner, under, inner = (images[n][k] for n in ("owner", "under", "inner"))
-            kept = tuple(instances[rows]), owner, under, inner, depths_m[k], ranges_m[rows]
-            assignment = PixelAssignment(*kept)
-            if len(owner) == self._camera.height:  # older versions kept them whole
-                assignment = _thinned(assignment)
-            self._remembered[keyframe_id] = _Remembered(assignment, surfaces[k])
-
-
-def _surface_arrays(names: LabelSet, views: Sequence[_Remembered]) -> Arrays:
-    """Their codes as named arrays; keyframes without them have none."""
-    kept = [(k, v.surfaces) for k, v in enumerate(views) if isinstance(v.surfaces, CodedSurfaces)]
-    own = [(k, c) for k, c in kept if c.labels == names]
-    return {
-        "coded": np.array([k for k, _ in own], np.int64),
-        "cell_px": np.array([c.cell_px for _, c in own], float),
-        "codes_shape": np.array([c.codes.shape for _, c in own], np.int64).ravel(),
-        "codes": np.concatenate([np.zeros(0, np.uint16), *(c.codes.ravel() for _, c in own)]),
-    }
-
-
-def _restored_surfaces(names: LabelSet, state: Arrays, count: int) -> list[CodedSurfaces | None]:
-    """The inverse, of ``count`` keyframes; states of older versions have none."""
-    found: list[CodedSurfaces | None] = [None] * count
-    if "coded" not in state:
-        return found
-    shapes, start = state["codes_shape"].reshape(-1, 2).tolist(), 0
-    rows = zip(state["coded"].tolist(), shapes, state["cell_px"].tolist(), strict=True)
-    for k, (height, width), cell_px in rows:
-        codes = state["codes"][start : start + height * width].reshape(height, width)
-        found[k] = CodedSurfaces(names, codes, cell_px)
-        start += height * width
-    return found
-
-
-def _thinned(assignment: PixelAssignment) -> PixelAssignment:
-    """Every THINNED-th pixel each way of a keyframe's masks and depth, without those masks."""
-    step = THINNED * assignment.depth_m.shape[0] // assignment.owner.shape[0]
-    every = np.s_[::THINNED, ::THINNED]
-    owner, under = assignment.owner[every].copy(), assignment.under[every].copy()
-    inner = assignment.inner[every].copy()
-    depth_m = assignment.depth_m[:: max(step, 1), :: max(step, 1)].copy()
-    without = tuple(replace(i, mask=_NO_MASK) for i in assignment.instances)
-    return PixelAssignment(without, owner, under, inner, depth_m, assignment.depth_range_m)
-
-
-def _instances(state: Arrays) -> Sequence[Instance]:
-    boxes, count = state["boxes"].reshape(-1, 4), max(len(state["labels"]), 1)
-    distributions = state["distributions"].reshape(-1, max(len(state["distributions"]) // count, 1))
-    scores = state["scores"].reshape(-1, 2).tolist()
-    return [
-        Instance(_NO_MASK, box, label, distribution, *score)
-        for box, label, distribution, score in zip(
-            boxes, state["labels"].tolist(), distributions, scores, strict=True
-        )
-    ]
+        self._remembered = RememberedMasks(self._labels.classes)
+        self._remembered.restore(state, self._surfaces.names, self._camera.height)

@@ -21,9 +21,14 @@ from bmask_slam.moving.keyframe_masks import KeyframeMasks
 from bmask_slam.semantics.beliefs.class_sizes import read_sizes
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.observation import observation_model
+from bmask_slam.semantics.beliefs.pixel_assignment import (
+    PixelAssignment,
+    assign_pixels,
+    check_instances,
+)
 from bmask_slam.semantics.beliefs.surface_geometry import Ground
 from bmask_slam.semantics.beliefs.surface_store import SurfaceStore
-from bmask_slam.semantics.beliefs.votes import PixelAssignment, assign_pixels, check_instances, vote
+from bmask_slam.semantics.beliefs.votes import vote
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.instances.surfaces import surfaces_of
 from bmask_slam.semantics.labels import LabelSet
@@ -67,10 +72,8 @@ class SemanticMapper:
         segmenter: Segmenter | None = None,
         on_masks: Callable[[KeyframeMasks], None] | None = None,
     ) -> None:
-        self._map = map_reader
-        self._on_masks = on_masks
-        self.camera = camera
-        self.config = config
+        self._map, self._on_masks = map_reader, on_masks
+        self.camera, self.config = camera, config
         self.segmenter = segmenter or NoSegmenter()
         self._rays = pixel_rays(camera, DEPTH_STEP)
         self._begin(self.segmenter.labels, getattr(self.segmenter, "measured", ""))
@@ -116,11 +119,9 @@ class SemanticMapper:
         """
         size = (self.camera.height, self.camera.width)
         check_instances(instances, size, self.names, f"keyframe {keyframe_id}")
-        observed = observed_by(keyframe_id, self._map)
-        refused = "" if observed is not None else "it is not in the map"
-        if keyframe_id in self._done:
-            refused = "it has its masks already"
-        if observed is None or refused:
+        observed, done = observed_by(keyframe_id, self._map), keyframe_id in self._done
+        if observed is None or done:
+            refused = "it has its masks already" if done else "it is not in the map"
             logger.info("masks of keyframe %d are not used: %s", keyframe_id, refused)
             return Attachment(keyframe_id, len(instances), refused=refused)
         self._done.add(keyframe_id)
@@ -129,8 +130,7 @@ class SemanticMapper:
         least, least_of_objects = self.config.least_scores(self.labels.model is not None)
         told, config = above(instances, least), self.config.votes
         everything = assign_pixels(told, waiting.depth_m, size, config, in_boxes=True)
-        surfaces = surfaces_of(instances)
-        spoken = self._label_votes.vote(keyframe_id, everything, observed, surfaces)
+        spoken = self._label_votes.vote(keyframe_id, everything, observed, surfaces_of(instances))
         if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
             found = self._placed(above(instances, least_of_objects), waiting.depth_m, observed)
             self._add_objects((keyframe_id, waiting), found, observed)
@@ -252,8 +252,7 @@ class SemanticMapper:
         sizes = read_sizes(names)
         self.objects = ObjectMap(self.camera, of_objects, self.config.objects, sizes)
         self._gravity = GravityEstimator()
-        self._done = set()
-        self._waiting = {}
+        self._done, self._waiting = set(), {}
 
     def _placed(
         self, instances: Sequence[Instance], depth_m: Floats, observed: Observed
@@ -263,8 +262,8 @@ class SemanticMapper:
         assignment = assign_pixels(instances, depth_m, size, config)
         visible = observed.located(self._map.world)
         votes = vote(assignment, visible.pixels, visible.z_m, len(self.names), config)
-        ids = observed.landmark_ids[votes.rows[votes.sure]]
-        return assignment, ids, votes.instances[votes.sure]
+        rows, on = votes.rows[votes.sure], votes.instances[votes.sure]
+        return assignment, observed.landmark_ids[rows], on
 
     def _add_objects(
         self,
@@ -288,8 +287,7 @@ class SemanticMapper:
         )
         objects = self.objects.add(view)
         if keyframe_id != observed.anchor.id:
-            parent = observed.anchor.id, observed.T_anchor_camera
-            self.objects.points.reanchor(keyframe_id, *parent)
+            self.objects.points.reanchor(keyframe_id, observed.anchor.id, observed.T_anchor_camera)
         on = np.append(objects, -1)[instances]
         self.objects.place_landmarks(ids[on >= 0], on[on >= 0])
 

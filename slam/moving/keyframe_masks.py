@@ -9,7 +9,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.moving.free_space_check import thinned_view
-from bmask_slam.semantics.beliefs.votes import PixelAssignment
+from bmask_slam.semantics.beliefs.pixel_assignment import PixelAssignment
 from bmask_slam.semantics.labels import LabelSet
 
 _SAMPLES = 400

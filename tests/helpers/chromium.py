@@ -25,7 +25,12 @@ FLAGS = (
 )  # fmt: skip
 DRAWING = (
     *(flag for flag in FLAGS if flag != "--disable-gpu"),
-    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--js-flags=--liftoff-only"),
+    *(
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--ignore-gpu-blocklist",
+        "--js-flags=--liftoff-only",
+    ),
 )
 """Of a browser that draws by WebGL, in software."""
 TIMEOUT_S = 240.0

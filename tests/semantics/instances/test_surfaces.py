@@ -67,11 +67,12 @@ def test_codes_tell_the_likeliest_class_of_the_cell_of_a_pixel() -> None:
     seen = classes()
     kept = coded(seen)
     columns, rows = np.meshgrid(np.arange(8) * 8.0 + 5, np.arange(6) * 8.0 + 2)
-    p = kept.at(np.stack([columns, rows], axis=-1).reshape(-1, 2)).reshape(6, 8, -1)
+    codes = kept.codes_at(np.stack([columns, rows], axis=-1).reshape(-1, 2))
+    p = kept.decoded(codes, kept.labels).reshape(6, 8, -1)
     np.testing.assert_array_equal(p.argmax(axis=2), seen.probabilities.argmax(axis=2))
     np.testing.assert_allclose(p.max(axis=2), seen.probabilities.max(axis=2), atol=3e-3)
     np.testing.assert_allclose(p.sum(axis=2), 1, atol=5e-3)
-    np.testing.assert_array_equal(kept.at(np.array([[-9.0, 999.0]]))[0], p[5, 0])
+    assert kept.codes_at(np.array([[-9.0, 999.0]])) == kept.codes[5, 0]
 
 
 def test_files_keep_the_likeliest_class(tmp_path: Path) -> None:

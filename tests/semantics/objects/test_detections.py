@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from bmask_slam.graph.camera import Camera
-from bmask_slam.semantics.beliefs.votes import VoteConfig, assign_pixels
+from bmask_slam.semantics.beliefs.pixel_assignment import assign_pixels
+from bmask_slam.semantics.beliefs.vote_config import VoteConfig
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.objects.detections import DetectionConfig, Detections, detect
 from bmask_slam.semantics.objects.object_map import pixel_rays

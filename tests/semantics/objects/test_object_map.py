@@ -11,8 +11,9 @@ from bmask_slam.graph.arrays import Array, Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import se3_exp, transform
 from bmask_slam.semantics.beliefs.label_store import LabelStore
+from bmask_slam.semantics.beliefs.pixel_assignment import assign_pixels
 from bmask_slam.semantics.beliefs.surface_geometry import Ground
-from bmask_slam.semantics.beliefs.votes import VoteConfig, assign_pixels
+from bmask_slam.semantics.beliefs.vote_config import VoteConfig
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.objects.association import AssociationConfig, Evidence, Overlap, assign
 from bmask_slam.semantics.objects.config import ObjectConfig

@@ -15,7 +15,7 @@ from test_semantic_mapper import (
     run,
 )
 
-from bmask_slam.labelling import landmark_votes as label_votes
+from bmask_slam.labelling import remembered_masks
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 
@@ -24,10 +24,10 @@ def test_keyframes_vote_on_landmarks_made_later(monkeypatch: pytest.MonkeyPatch)
     """All recent keyframes that show the last keyframe's new landmarks vote on them."""
     views, shares = {}, {}
     for recent in (0, 3):
-        monkeypatch.setattr(label_votes, "REMEMBERED", recent)
+        monkeypatch.setattr(remembered_masks, "REMEMBERED", recent)
         system = run(Sides(FRAMES), MANY_KEYFRAMES)
         views[recent], shares[recent] = estimates(system).views, right_share(system)
-        assert len(system.semantics._label_votes._remembered) == recent
+        assert len(system.semantics._label_votes._remembered.rows) == recent
     ids, world = system.landmarks().ids, system.mapper.world
     last = world.landmarks.host[ids] == max(world.keyframes)
     gained = views[3] - views[0]

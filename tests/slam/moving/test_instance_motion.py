@@ -12,7 +12,8 @@ from bmask_slam.moving.free_space_check import FreeSpaceCheck, FreeSpaceCheckCon
 from bmask_slam.moving.instance_motion import InstanceMotion
 from bmask_slam.moving.keyframe_masks import KeyframeMasks
 from bmask_slam.semantics.beliefs.movability import read_priors
-from bmask_slam.semantics.beliefs.votes import VoteConfig, assign_pixels
+from bmask_slam.semantics.beliefs.pixel_assignment import assign_pixels
+from bmask_slam.semantics.beliefs.vote_config import VoteConfig
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.tracks.instance_track import Track
 

@@ -12,7 +12,8 @@ from bmask_slam.moving.depth_view_buffer import PosedView
 from bmask_slam.moving.free_space_check import FreeSpaceCheck, FreeSpaceCheckConfig, depth_view
 from bmask_slam.moving.keyframe_masks import KeyframeMasks, surfaces
 from bmask_slam.moving.static_verification import StaticVerification, StaticVerificationConfig
-from bmask_slam.semantics.beliefs.votes import VoteConfig, assign_pixels
+from bmask_slam.semantics.beliefs.pixel_assignment import assign_pixels
+from bmask_slam.semantics.beliefs.vote_config import VoteConfig
 from bmask_slam.semantics.instances.instances import Instance, certain
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.tracks.instance_track import Track
