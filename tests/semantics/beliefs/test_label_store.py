@@ -7,6 +7,8 @@ import pytest
 
 from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
 from bmask_slam.semantics.beliefs.label_store import LabelStore
+from bmask_slam.semantics.beliefs.observation import GROUPS, observation_model
+from bmask_slam.semantics.labels import read_label_set
 
 C = 5
 PRIOR = np.array([0.5, *4 * [0.125]])
@@ -209,3 +211,29 @@ def test_an_id_beyond_the_capacity_is_moved_to_a_smaller_id_and_back() -> None:
     assert np.array_equal(store.probabilities(ids), whole.probabilities(ids))
     store.move(np.array([3000]), np.array([9000]))
     assert store.known().tolist() == [9000]
+
+
+@pytest.mark.parametrize("measured", ["", "light"])
+def test_views_fused_at_once_equal_those_fused_one_after_another(measured: str) -> None:
+    """Of things that are seen several times, also from one viewpoint, and missed in between."""
+    names, rng, count = read_label_set("coco"), np.random.default_rng(5), 400
+    model = observation_model(measured, names)
+    at_once, in_turn = (LabelStore(len(names), model=model) for _ in range(2))
+    ids, cells = rng.integers(0, 60, count), rng.integers(0, 5, count)
+    missed = rng.random(count) < 0.4
+    distributions = rng.dirichlet(np.full(len(names), 0.05), count).astype(np.float32)
+    weights = rng.uniform(0.2, 1.0, count).astype(np.float32)
+    groups = 1 if model is None else GROUPS
+    misses = rng.uniform(0.2, 1.0, (count, groups)).astype(np.float32)
+    told = distributions[~missed], weights[~missed]
+    at_once.fuse(ids, missed, told, misses[missed], cells)
+    for k in range(count):
+        one = slice(k, k + 1)
+        if missed[k]:
+            in_turn.miss(ids[one], misses[one], cells[one])
+        else:
+            in_turn.update(ids[one], distributions[one], weights[one], cells[one])
+    states = at_once.state(), in_turn.state()
+    assert states[0]["views"].sum() == count
+    for name, array in states[0].items():
+        np.testing.assert_array_equal(array, states[1][name], err_msg=name)
