@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import importlib
+from importlib.util import find_spec
 from types import ModuleType
 
 from bmask_slam.graph.errors import InputError
@@ -29,6 +30,16 @@ def import_extra(name: str, needed_by: str, extra: str, instead: str = "") -> Mo
         if not missing:
             cure = f"remove it, and {cure}"
         raise InputError(f"{text}; {cure}{f', or {instead}' if instead else ''}") from error
+
+
+def check_extra(name: str, needed_by: str, extra: str, instead: str = "") -> None:
+    """As ``import_extra``, of a library that another process will load: whether it is installed.
+
+    Raises:
+        InputError: it is not.
+    """
+    if find_spec(name) is None:
+        import_extra(name, needed_by, extra, instead)
 
 
 def import_dense(needed_by: str) -> None:

@@ -20,7 +20,7 @@ from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.moving.moving_object_filter import MovingObjectFilter
 from bmask_slam.moving.static_features import StaticFeatures
 from bmask_slam.runtime.stage_clock import stage
-from bmask_slam.semantics.segmenters.segmenter import Segmenter
+from bmask_slam.semantics.segmenters.segmenter import Segmenter, begin_early
 from bmask_slam.sensor_input import SensorSystem
 from bmask_slam.sequences.frame import Frame, check_frame
 from bmask_slam.system_config import SystemConfig
@@ -242,6 +242,7 @@ class SlamSystem(SensorSystem):
         reason = "" if restored else self.keyframes.reason(tracked)
         if not reason:
             return tracked, None, ""
+        begin_early(self.semantics.segmenter, frame.rgb, frame.name)
         if self.markers is not None and len((seen := self.markers.detect(frame, self.camera)).rows):
             self.map.add_measurements(seen)
         return *self.insert(frame, tracked, self.camera_tracker.local_ids), reason

@@ -38,6 +38,8 @@ class SmootherConfig:
             observed by at most so many keyframes; each group becomes relative poses of its own.
         base_share: a keyframe that shares a smaller part of its marginalised landmarks with any
             base becomes one (`graph.marginals.sparsification`).
+        least_decrease: relative decrease of the cost in an iteration below which an optimisation of
+            the whole graph ends. Below it outliers creep on for a hundred iterations.
         max_repairs: attempts to rebuild after failures before the update is given up.
     """
 
@@ -61,6 +63,7 @@ class SmootherConfig:
     anchor_sigma_translation_m: float = 0.1
     marginal_keyframes: int = 24
     base_share: float = 0.25
+    least_decrease: float = 1e-5
     max_repairs: int = 10
 
     def __post_init__(self) -> None:

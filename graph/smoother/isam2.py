@@ -142,7 +142,7 @@ class Solver:
         graph, values = self._everything(tables)
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(max_iterations)
-        parameters.setRelativeErrorTol(1e-7)
+        parameters.setRelativeErrorTol(self._config.least_decrease)
         started_s = time.perf_counter()
         try:
             before = graph.error(values)
@@ -186,8 +186,8 @@ class Solver:
 
     def _everything(self, tables: FactorTables) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """All factors and values, in an order that depends on the tables' contents alone."""
-        numbers = sorted(tables.pose_factors)
-        factors = self._factors(tables, tables.observations.all_rows(), numbers)
+        rows, numbers = tables.observations.all_rows(), sorted(tables.pose_factors)
+        factors = self._factors(tables, rows, numbers)
         tables.inertial.prune(tables.keyframes.ids)
         inertial, variables = inertial_graph(tables.inertial)
         graph = make_graph([*factors, *own_gtsam_factors(tables), *inertial])
@@ -216,9 +216,8 @@ class Solver:
         insert_states(values, tables.inertial, change.inertial)
         slots, estimate = self._run(graph, values, change)
         poses, points = read_values(estimate)
-        count = len(tables.landmarks.ids)
-        expected = len(tables.keyframes.ids), count + len(tables.inertial.states)
-        if (len(poses), len(points)) != expected:
+        count, states = len(tables.landmarks.ids), len(tables.inertial.states)
+        if (len(poses), len(points)) != (len(tables.keyframes.ids), count + states):
             self._isam = None
             raise SolverError("ISAM2 and the factor tables have different variables", None)
         points = points[:count]
@@ -244,13 +243,12 @@ class Solver:
                 self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), removed)
                 removed = []  # an id that was removed is used again: remove it first
             result = self._isam.update(graph, values, removed, poses_last(graph))
-            slots = result.getNewFactorsIndices()
             for _ in range(self._config.extra_iterations):
                 self._isam.update()
             for _ in range(change.max_iterations):
                 if self._isam.update().getVariablesRelinearized() == 0:
                     break
-            return slots, self._isam.calculateEstimate()
+            return result.getNewFactorsIndices(), self._isam.calculateEstimate()
         except Exception as error:  # a user's factor may raise any
             raise self._failure(error) from error
         finally:

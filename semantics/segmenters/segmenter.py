@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -32,6 +32,20 @@ class Segmenter(Protocol):
         ``name`` is the image's file name relative to its sequence, for look-ups and errors. A
         segmenter that also tells what all pixels are gives a ``Segmented``.
         """
+
+
+@runtime_checkable
+class EarlySegmenter(Protocol):
+    """A segmenter that works beside its caller."""
+
+    def begin(self, image: Image, name: str) -> None:
+        """Begin with an image whose instances will be asked for next; returns at once."""
+
+
+def begin_early(segmenter: Segmenter, image: Image, name: str) -> None:
+    """Let a segmenter begin with an image, if it can before the instances are asked for."""
+    if isinstance(segmenter, EarlySegmenter):
+        segmenter.begin(image, name)
 
 
 def check_image(image: Image, name: str) -> None:

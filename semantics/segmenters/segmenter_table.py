@@ -26,6 +26,7 @@ NAMES = {
     "truth": "the annotations of a rendered sequence",
     "none": "no instances",
 }
+NETWORKS = ("light", "mask-scoring-rcnn")
 TRUTH_FILE = "annotations.json"
 
 
@@ -58,6 +59,11 @@ class SegmenterOptions:
     def named(cls, name: str) -> SegmenterOptions:
         """Options with a name that the user wrote; only such a ``module:Class`` is imported."""
         return cls(written(name))
+
+    @property
+    def is_network(self) -> bool:
+        """Whether it is a network of this project, of which an image takes long."""
+        return self.name in NETWORKS
 
     def described(self) -> dict[str, str]:
         """The options as text, to compare with those of another run."""
@@ -130,8 +136,7 @@ def _network(options: SegmenterOptions, find_weights: FindWeights) -> Segmenter:
     """A network segmenter; torch is imported here since that takes a second."""
     if options.weights is None and options.name != "light":
         raise InputError(f"segmenter {options.name!r}: give --weights, a file or torchvision:NAME")
-    instead = "take --segmenter none: no labels, objects or masks"
-    import_extra("torch", f"segmenter {options.name!r}", "semantics", instead)
+    import_extra(*needed_by(options))
     from bmask_slam.semantics.network.yolox.selection import SelectionConfig  # noqa: PLC0415
     from bmask_slam.semantics.segmenters.light_segmenter import LightSegmenter  # noqa: PLC0415
     from bmask_slam.semantics.segmenters.network_segmenter import NetworkSegmenter  # noqa: PLC0415
@@ -158,6 +163,12 @@ def _network(options: SegmenterOptions, find_weights: FindWeights) -> Segmenter:
     body = other.model.config.backbone
     _check_kind(options, "light" if body == "mobilenet_v2" else "mask-scoring-rcnn", body)
     return NetworkSegmenter(other, options.min_score, detector)
+
+
+def needed_by(options: SegmenterOptions) -> tuple[str, str, str, str]:
+    """What a network needs, as arguments of `graph.extras.import_extra`."""
+    instead = "take --segmenter none: no labels, objects or masks"
+    return "torch", f"segmenter {options.name!r}", "semantics", instead
 
 
 def _check_kind(options: SegmenterOptions, name: str, body: str) -> None:

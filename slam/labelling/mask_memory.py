@@ -7,7 +7,7 @@ from dataclasses import replace
 from bmask_slam.graph.arrays import Image
 from bmask_slam.semantics.instances.instances import Instance, PackedMask
 from bmask_slam.semantics.instances.surfaces import Segmented, SurfaceClasses, surfaces_of
-from bmask_slam.semantics.segmenters.segmenter import Segmenter
+from bmask_slam.semantics.segmenters.segmenter import Segmenter, begin_early
 
 _Packed = tuple[list[tuple[Instance, PackedMask]], SurfaceClasses | None]
 
@@ -24,6 +24,10 @@ class MaskMemory:
             return None
         packed, surfaces = self._found[name]
         return Segmented([replace(i, mask=mask.unpacked()) for i, mask in packed], surfaces)
+
+    def knows(self, name: str) -> bool:
+        """Whether the instances in an image are known."""
+        return self._found is not None and name in self._found
 
     def keep(self, name: str, instances: list[Instance]) -> None:
         """Keep the instances in an image."""
@@ -43,6 +47,11 @@ class RememberingSegmenter:
         self.labels = segmenter.labels
         self.measured = getattr(segmenter, "measured", "")
         self._segmenter, self._memory = segmenter, memory
+
+    def begin(self, image: Image, name: str) -> None:
+        """Begin with an image that is not known, where the segmenter works beside this process."""
+        if not self._memory.knows(name):
+            begin_early(self._segmenter, image, name)
 
     def segment(self, image: Image, name: str) -> list[Instance]:
         """The instances in an image."""

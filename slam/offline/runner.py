@@ -17,7 +17,6 @@ from typing import Any
 
 from bmask_slam.calibration.adoption import SelfCalibration
 from bmask_slam.config.configuration import dump
-from bmask_slam.datasets.weights import find_weights
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import import_dense
@@ -42,7 +41,6 @@ from bmask_slam.run_folder.open_files import free_run_path
 from bmask_slam.run_folder.origin import Origin
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.runtime.stop_request import StopRequest
-from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
 from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
@@ -232,9 +230,11 @@ def _system_maker(
     elif options.localise:
         yield SlamSystem, None
     else:
+        from bmask_slam.parallel.segmenter_beside import segmenter_of_run  # noqa: PLC0415
+
         masks = MaskMemory()
-        segmenter = RememberingSegmenter(make_segmenter(chosen, folder, find_weights), masks)
-        yield partial(SlamSystem, segmenter=segmenter), masks
+        with segmenter_of_run(chosen, folder) as segmenter:
+            yield partial(SlamSystem, segmenter=RememberingSegmenter(segmenter, masks)), masks
 
 
 def with_sensors(system: System, sequence: Sequence) -> System:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import os
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't start new thread")
@@ -22,19 +23,42 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def peak_rss_mb() -> float:
-    """Largest resident memory of this process so far in MB (1e6 bytes).
+    """Largest resident memory so far in MB (1e6 bytes), with that of the processes it has.
 
-    Linux's VmHWM; elsewhere getrusage, which on Linux would count the parent's memory too.
+    Linux's VmHWM, each process at its own peak; of one with children, such as the server that
+    workers are forked from, these have its memory too. Elsewhere getrusage, which on Linux would
+    count the parent's memory too, of this process alone.
     """
-    status = Path("/proc/self/status")
-    if status.exists():
-        match = re.search(r"VmHWM:\s+(\d+) kB", status.read_text(encoding="ascii"))
-        if match:
-            return int(match[1]) * 1024 / 1e6
+    if own := _linux_peak_mb(os.getpid()):
+        return own + sum(_peak_of_leaves_mb(child) for child in _children(os.getpid()))
     import resource  # noqa: PLC0415 - Unix only
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak * (1 if sys.platform == "darwin" else 1024) / 1e6
+
+
+def _linux_peak_mb(pid: int) -> float:
+    """Peak of a process; 0 where it is not told, or the process has ended."""
+    with suppress(OSError):
+        status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
+        if match := re.search(r"VmHWM:\s+(\d+) kB", status):
+            return int(match[1]) * 1024 / 1e6
+    return 0.0
+
+
+def _children(pid: int) -> list[int]:
+    """Process ids of a process's children."""
+    found: list[int] = []
+    for path in Path(f"/proc/{pid}/task").glob("*/children"):
+        with suppress(OSError):
+            found += map(int, path.read_text(encoding="ascii").split())
+    return found
+
+
+def _peak_of_leaves_mb(pid: int) -> float:
+    """The peaks of a process's descendants that have no children, or its own if it has none."""
+    children = _children(pid)
+    return sum(map(_peak_of_leaves_mb, children)) if children else _linux_peak_mb(pid)
 
 
 def memory_limit_bytes() -> int | None:

@@ -12,9 +12,12 @@ from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.graph.smoother.smoother import Smoother
 
+EXACT = SmootherConfig(least_decrease=1e-7)
+"""So that optima can be compared."""
+
 
 def filled(room: Room, config: SmootherConfig | None = None) -> Smoother:
-    smoother = Smoother(CAMERA, config)
+    smoother = Smoother(CAMERA, config or EXACT)
     for update in room.updates():
         smoother.update(update)
     return smoother
@@ -25,7 +28,7 @@ def from_scratch(smoother: Smoother, room: Room) -> GraphEstimate:
     tables = smoother._tables
     observations = tables.observations.all()
     factors = [f.factor for f in tables.pose_factors.values()]
-    fresh = Smoother(CAMERA)
+    fresh = Smoother(CAMERA, EXACT)
     fresh.update(
         GraphUpdate(
             tables.keyframes.ids,

@@ -26,10 +26,14 @@ MAX_KEPT = 100
 
 
 def serve_segmenter(
-    channel: Channel, options: SegmenterOptions, sequence: Path, waiting: int
+    channel: Channel,
+    options: SegmenterOptions,
+    sequence: Path,
+    waiting: int,
+    niceness: int = NICENESS,
 ) -> None:
     """Segment images until the channel ends, the newest first; at most ``waiting`` wait."""
-    os.nice(NICENESS)
+    os.nice(niceness)
     segmenter = make_segmenter(options, sequence, find_weights)
     channel.send(Ready(segmenter.labels.names))
     stack: list[ImageToSegment] = []
@@ -59,6 +63,8 @@ class RemoteSegmenter:
         worker: the supervised process.
     """
 
+    niceness = NICENESS
+
     def __init__(
         self,
         options: SegmenterOptions,
@@ -77,7 +83,8 @@ class RemoteSegmenter:
             self.worker = DistantWorker(name, arguments, workstation)
         else:
             target = f"{__name__}:serve_segmenter"
-            self.worker = SupervisedWorker(name, target, arguments, policy or RestartPolicy())
+            here = (*arguments, self.niceness)
+            self.worker = SupervisedWorker(name, target, here, policy or RestartPolicy())
         self.labels = LabelSet(self.worker.wait_until_ready().labels)
 
     @property
@@ -108,14 +115,17 @@ class RemoteSegmenter:
                     self.segmentation_ms.append(message.segmentation_ms)
                     found.append(message)
                 case NotSegmented():
-                    self.dropped += 1
-                    logger.info("keyframe %d has no masks: %s", message.keyframe_id, message.reason)
+                    self._not_segmented(message)
         if self.worker.restart_if_needed(busy=bool(self._requested)):
             for image in self._requested.values():
                 self.worker.send(image)
         if self.worker.given_up:
             self._requested.clear()
         return found
+
+    def _not_segmented(self, message: NotSegmented) -> None:
+        self.dropped += 1
+        logger.info("keyframe %d has no masks: %s", message.keyframe_id, message.reason)
 
     def close(self) -> None:
         """Kill the process."""

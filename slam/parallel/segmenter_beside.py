@@ -1,0 +1,94 @@
+"""A network in a process of its own, which works while the keyframe enters the map."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from bmask_slam.datasets.weights import find_weights
+from bmask_slam.graph.arrays import Image
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.extras import check_extra
+from bmask_slam.live.messages import ImageToSegment, NotSegmented
+from bmask_slam.live.processes.segmentation import RemoteSegmenter
+from bmask_slam.live.processes.supervision import RestartPolicy
+from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.segmenters.segmenter import Segmenter, check_image
+from bmask_slam.semantics.segmenters.segmenter_table import (
+    SegmenterOptions,
+    make_segmenter,
+    measured_name,
+    needed_by,
+)
+
+ANSWER_S = 600.0
+"""Longest time for an image: a large network on an old processor takes a minute."""
+POLL_S = 0.0005
+
+
+class SegmenterBeside(RemoteSegmenter):
+    """A segmenter whose answers are those that it would give in this process.
+
+    Attributes:
+        measured: under what name the errors of its masks were measured, "" if they were not.
+    """
+
+    niceness = 0
+
+    def __init__(self, options: SegmenterOptions, sequence: Path) -> None:
+        """Start the process, for the images of a sequence. Raises InputError if it cannot start."""
+        super().__init__(options, sequence, RestartPolicy(answer_s=ANSWER_S))
+        self.measured = measured_name(options)
+        self._begun = 0, ""
+        self._reasons: dict[int, str] = {}
+
+    def begin(self, image: Image, name: str) -> None:
+        """Begin with an image whose instances will be asked for next; returns at once."""
+        check_image(image, name)
+        self._begun = self._begun[0] + 1, name
+        self.request(ImageToSegment(self._begun[0], image, name))
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        """The instances in an image, once they have come.
+
+        Raises:
+            InputError: the image cannot be segmented, or the process died too often.
+        """
+        if self._begun[1] != name:
+            self.begin(image, name)
+        number = self._begun[0]
+        self._begun = number, ""
+        while self.awaits(number):
+            for masks in self.receive_masks():
+                if masks.keyframe_id == number:
+                    return masks.instances
+            time.sleep(POLL_S)
+        died = f"{name}: the segmenter's process died too often"
+        raise InputError(self._reasons.pop(number, died))
+
+    def _not_segmented(self, message: NotSegmented) -> None:
+        self._reasons[message.keyframe_id] = message.reason
+
+
+@contextmanager
+def segmenter_of_run(options: SegmenterOptions, sequence: Path) -> Iterator[Segmenter]:
+    """The segmenter of an offline run: a network beside it, where there is a second processor.
+
+    Raises InputError.
+    """
+    if options.is_network and not options.ray and _processors() > 1:
+        check_extra(*needed_by(options))
+        with closing(SegmenterBeside(options, sequence)) as segmenter:
+            yield segmenter
+    else:
+        yield make_segmenter(options, sequence, find_weights)
+
+
+def _processors() -> int:
+    """Number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
