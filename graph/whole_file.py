@@ -42,6 +42,20 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
+def writing(path: Path, cure: str = "free some space, or change its permissions") -> Iterator[None]:
+    """For a block that writes ``path``.
+
+    Raises:
+        InputError: it cannot be written; the text gives the reason and the cure.
+    """
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"{path}: cannot be written ({reason}); {cure}") from error
+
+
+@contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
     """An empty temporary folder beside ``path``; else as ``whole_file``."""
     temporary = _temporary(path)

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Bytes, Image, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, transform
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.whole_file import whole_file, writing
 
 BACKGROUND_COLOUR, WALL_COLOUR = (150, 150, 150), (70, 70, 80)
 WALL = "wall"
@@ -93,12 +92,6 @@ def write_picture(path: Path, image: Image) -> Path:
     OpenCV would not say that the last bytes of a file found no space.
     """
     packed = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
-    try:
-        with whole_file(path) as temporary:
-            temporary.write_bytes(packed.tobytes())
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written ({error.strerror}); free some space, or change its "
-            "permissions"
-        ) from error
+    with writing(path), whole_file(path) as temporary:
+        temporary.write_bytes(packed.tobytes())
     return path

@@ -33,7 +33,7 @@ from bmask_slam.comparison.jobs.plan import Plan, make_plan
 from bmask_slam.comparison.jobs.pool import LocalPool, Pool, RayPool
 from bmask_slam.comparison.report import write_report
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.whole_file import open_plain
+from bmask_slam.graph.whole_file import open_plain, writing
 
 logger = logging.getLogger(__name__)
 
@@ -197,13 +197,9 @@ def _relative(plan: Plan, path: str) -> str:
 @contextmanager
 def _locked(folder: Path) -> Iterator[Path]:
     """Make the folder if needed and lock it for this process. Raises InputError."""
-    try:
+    with writing(folder, "choose another --out"):
         folder.mkdir(parents=True, exist_ok=True)
         file = open_plain(folder / ".lock", "w")
-    except OSError as error:
-        raise InputError(
-            f"{folder}: cannot be written ({error.strerror}); choose another --out"
-        ) from error
     with file:
         if sys.platform != "win32":
             import fcntl  # noqa: PLC0415 - Unix only

@@ -42,7 +42,7 @@ from bmask_slam.graph.files.array_file import FileKind, check_like, read_arrays,
 from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.files.json_file import Name, check_json, read_json
 from bmask_slam.graph.files.reading import MAX_LINE, read_bytes
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.whole_file import whole_file, writing
 from bmask_slam.mapping.inverse_depth.dense_mapper import FusedKeyframe
 from bmask_slam.mapping.inverse_depth.depth_map import (
     InverseDepthMap,
@@ -123,7 +123,7 @@ class DenseFolder:
         self.path = run / "dense"
         for path in (self.path, *(self.path / name for name in PARTS)):
             refuse_link(path)
-        try:
+        with writing(self.path):
             self.path.mkdir(exist_ok=True)
             self._clear_unless(self.settings)
             for name in PARTS:
@@ -131,11 +131,6 @@ class DenseFolder:
             self.write_text(
                 "settings.json", json.dumps(self.settings, indent=1, sort_keys=True) + "\n"
             )
-        except OSError as error:
-            raise InputError(
-                f"{self.path}: cannot be written ({error.strerror}); free some space, or change "
-                "its permissions"
-            ) from error
 
     @classmethod
     def open(cls, run: Path) -> DenseFolder:
@@ -285,11 +280,8 @@ class DenseFolder:
 
 def _copy(source: Path, target: Path) -> None:
     """Copy a file whole. Raises InputError if it cannot be read or written."""
-    try:
-        with whole_file(target) as temporary:
-            temporary.write_bytes(read_bytes(source, "map its run again"))
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror}); free space") from error
+    with writing(target), whole_file(target) as temporary:
+        temporary.write_bytes(read_bytes(source, "map its run again"))
 
 
 def _write_evidence(path: Path, evidence: InstanceEvidence) -> None:

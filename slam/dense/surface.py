@@ -21,7 +21,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.trajectory import nearest_indices, read_tum
-from bmask_slam.graph.whole_file import remove
+from bmask_slam.graph.whole_file import remove, writing
 from bmask_slam.mapping.inverse_depth.depth_map import MeasurementConfig, from_sensor
 from bmask_slam.mapping.inverse_depth.regularisation import regularise
 from bmask_slam.mapping.products.surface_labels import dilate
@@ -242,16 +242,11 @@ def read_or_clear(folder: Path, made_of: dict[str, Any]) -> Arrays | None:
     Raises:
         InputError: it cannot be written.
     """
-    try:
+    with writing(folder):
         arrays = read_kept(folder / INDEX, made_of)
         if arrays is None:
             remove(folder)
             folder.mkdir()
-    except OSError as error:
-        raise InputError(
-            f"{folder}: cannot be written ({error.strerror}); free some space, or change its "
-            "permissions"
-        ) from error
     return arrays
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import quaternion_from_rotation
-from bmask_slam.graph.whole_file import whole_folder
+from bmask_slam.graph.whole_file import whole_folder, writing
 
 _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
@@ -32,13 +32,9 @@ def new_folder(out: Path) -> Iterator[Path]:
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file, not a folder; choose another --out")
     with ExitStack() as stack:
-        try:
+        with writing(out, "choose another --out"):
             out.parent.mkdir(parents=True, exist_ok=True)
             temporary = stack.enter_context(whole_folder(out))
-        except OSError as error:
-            raise InputError(
-                f"{out}: cannot be written ({error.strerror}); choose another --out"
-            ) from error
         yield temporary
 
 

@@ -38,8 +38,8 @@ from __future__ import annotations
 import errno
 import logging
 import os
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -48,7 +48,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.files.growing_table import check_grown, lock_file
 from bmask_slam.graph.trajectory import Trajectory, write_tum
-from bmask_slam.graph.whole_file import remove, remove_partial, whole_file
+from bmask_slam.graph.whole_file import remove, remove_partial, whole_file, writing
 from bmask_slam.run_folder.covariance_file import COVARIANCES
 from bmask_slam.run_folder.frame_file import COLUMNS, FRAMES, frame_row
 from bmask_slam.run_folder.landmark_file import MARKERS
@@ -72,6 +72,7 @@ SOMETIMES = (
     *SEMANTIC_FILES,
 )
 OF_MERGED_RUNS = "trajectory_run_*.txt"
+ELSEWHERE = "choose another folder with --out"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("bmask_slam",)
 GROWING = {FRAMES: COLUMNS, EVENTS: EVENT_COLUMNS}
@@ -111,7 +112,7 @@ class RunFolder:
                 refuse_link(path / name, "start the run again with --overwrite")
         for name, size in kept.items():
             check_grown(path / name, GROWING[name], size)
-        try:
+        with writing(path, ELSEWHERE), self._unmade_on_error():
             self._files = OpenFiles(path, GROWING, "a" if self._keep else "x")
             self._tables, self._log = self._files.tables, self._files.log
             with self._files.undone_on_error():
@@ -119,10 +120,16 @@ class RunFolder:
                 for name, table in self._tables.items():
                     table.begin(kept.get(name, 0))
                 remove_partial(path)
-        except OSError as error:
-            _remove_empty(self._made)
-            raise _unwritable(path, error) from error
         self._levels: dict[str, int] = {}
+
+    @contextmanager
+    def _unmade_on_error(self) -> Iterator[None]:
+        """Where nothing can be written, the empty folders that were made are removed again."""
+        try:
+            yield
+        except OSError:
+            _remove_empty(self._made)
+            raise
 
     @property
     def path(self) -> Path:
@@ -250,30 +257,22 @@ def _clear(path: Path, overwrite: bool) -> None:
             f"{path}: already holds a run ({held[0]}); {cure}choose another --out or add "
             "--overwrite"
         )
-    try:
+    with writing(path, ELSEWHERE):
         if FRAMES in held:
             with (path / FRAMES).open("rb") as file:
                 lock_file(file, path)
         _remove(path, [*held, *(old.name for old in path.glob(OF_MERGED_RUNS) if held)])
-    except OSError as error:
-        raise _unwritable(path, error) from error
 
 
 def _make_folder(path: Path) -> list[Path]:
     """Make a folder and its parents; returns those that were made, the innermost first."""
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except FileExistsError as error:
-        raise InputError(f"{path}: is a file; choose another folder with --out") from error
-    except OSError as error:
-        raise _unwritable(path, error) from error
+    with writing(path, ELSEWHERE):
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except FileExistsError as error:
+            raise InputError(f"{path}: is a file; {ELSEWHERE}") from error
     return missing
-
-
-def _unwritable(path: Path, error: OSError) -> InputError:
-    reason = error.strerror or error
-    return InputError(f"{path}: cannot be written ({reason}); choose another folder with --out")
 
 
 def _is_bug(error: BaseException) -> bool:

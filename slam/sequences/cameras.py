@@ -14,7 +14,7 @@ import numpy as np
 from bmask_slam.graph.camera import MAX_SIDE_PX, NO_DEPTH_DISTORTION, Camera, DepthNoise
 from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.files.yaml_file import format_yaml, read_yaml
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.whole_file import whole_file, writing
 from bmask_slam.sequences.camera_presets import (
     PRESETS,
     completed,
@@ -193,11 +193,8 @@ def _values(path: Path) -> dict[str, object]:
 
 def write_camera(path: Path, camera: Camera, comment: str = "") -> None:
     """Write a camera.yaml, the text of ``format_camera``; it appears whole or not at all."""
-    try:
-        with whole_file(path) as temporary:
-            temporary.write_text(format_camera(camera, comment), encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+    with writing(path), whole_file(path) as temporary:
+        temporary.write_text(format_camera(camera, comment), encoding="utf-8")
 
 
 def format_camera(camera: Camera, comment: str = "") -> str:
