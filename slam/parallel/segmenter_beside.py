@@ -47,7 +47,6 @@ class SegmenterBeside(RemoteSegmenter):
 
     def begin(self, image: Image, name: str) -> None:
         """Begin with an image whose instances will be asked for next; returns at once."""
-        check_image(image, name)
         self._begun = self._begun[0] + 1, name
         self.request(ImageToSegment(self._begun[0], image, name))
 
@@ -57,6 +56,7 @@ class SegmenterBeside(RemoteSegmenter):
         Raises:
             InputError: the image cannot be segmented, or the process died too often.
         """
+        check_image(image, name)
         if self._begun[1] != name:
             self.begin(image, name)
         number = self._begun[0]
