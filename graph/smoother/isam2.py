@@ -36,7 +36,6 @@ from bmask_slam.graph.inertial.preintegration import (
 )
 from bmask_slam.graph.inertial.tables import InertialChange
 from bmask_slam.graph.marginals.covariances import Marginals, marginals_of
-from bmask_slam.graph.smoother.huge_pages import use_huge_pages
 
 
 class SolverError(Exception):
@@ -237,7 +236,6 @@ class Solver:
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, change: Change
     ) -> tuple[list[int], gtsam.Values]:
         assert self._isam is not None
-        use_huge_pages()
         removed, started_s = change.removed_slots, time.perf_counter()
         try:
             keys = values.keys() if removed else []
