@@ -216,8 +216,9 @@ class Solver:
         insert_states(values, tables.inertial, change.inertial)
         slots, estimate = self._run(graph, values, change)
         poses, points = read_values(estimate)
-        count, states = len(tables.landmarks.ids), len(tables.inertial.states)
-        if (len(poses), len(points)) != (len(tables.keyframes.ids), count + states):
+        count = len(tables.landmarks.ids)
+        expected = len(tables.keyframes.ids), count + len(tables.inertial.states)
+        if (len(poses), len(points)) != expected:
             self._isam = None
             raise SolverError("ISAM2 and the factor tables have different variables", None)
         points = points[:count]
@@ -243,12 +244,13 @@ class Solver:
                 self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), removed)
                 removed = []  # an id that was removed is used again: remove it first
             result = self._isam.update(graph, values, removed, poses_last(graph))
+            slots = result.getNewFactorsIndices()
             for _ in range(self._config.extra_iterations):
                 self._isam.update()
             for _ in range(change.max_iterations):
                 if self._isam.update().getVariablesRelinearized() == 0:
                     break
-            return result.getNewFactorsIndices(), self._isam.calculateEstimate()
+            return slots, self._isam.calculateEstimate()
         except Exception as error:  # a user's factor may raise any
             raise self._failure(error) from error
         finally:

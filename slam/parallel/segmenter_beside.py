@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -15,6 +14,7 @@ from bmask_slam.graph.extras import check_extra
 from bmask_slam.live.messages import ImageToSegment, NotSegmented
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
+from bmask_slam.runtime.machine import available_cores
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.segmenters.segmenter import Segmenter, check_image
 from bmask_slam.semantics.segmenters.segmenter_table import (
@@ -79,16 +79,9 @@ def segmenter_of_run(options: SegmenterOptions, sequence: Path) -> Iterator[Segm
 
     Raises InputError.
     """
-    if options.is_network and not options.ray and _processors() > 1:
+    if options.is_network and not options.ray and available_cores() > 1:
         check_extra(*needed_by(options))
         with closing(SegmenterBeside(options, sequence)) as segmenter:
             yield segmenter
     else:
         yield make_segmenter(options, sequence, find_weights)
-
-
-def _processors() -> int:
-    """Number of processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

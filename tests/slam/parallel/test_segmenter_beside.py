@@ -92,7 +92,7 @@ def test_a_run_gives_the_same_bytes_with_one_processor(
     """Where there is one, the network is in the run's own process."""
     config = resolve(SystemConfig, None, ("semantics.segmenter.name=light",))
     for name, processors in (("here", 1), ("beside", 2)):
-        monkeypatch.setattr(segmenter_beside, "_processors", lambda n=processors: n)
+        monkeypatch.setattr(segmenter_beside, "available_cores", lambda n=processors: n)
         run(RunOptions(office, config, out=tmp_path / name, quiet=True, max_frames=8))
     for name in ("trajectory.txt", "map", "labels.csv", "objects.json"):
         assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "beside" / name).read_bytes()
