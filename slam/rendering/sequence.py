@@ -43,6 +43,7 @@ SCENES: dict[str, str] = {
     "crowded_office": "the busy office with people who walk along close before the camera",
     "living_room": "a living room with sofa, television, dining table and bookcase; one round",
     "corridor": "a square corridor, a loop of 30 m that ends where it began",
+    "building": "three storeys of look-alike rooms along corridors, 626 m; 13 minutes of walking",
     "room": "a room drawn at random from the seed: size, walls, light, furniture and round",
 }
 """Names and one-line descriptions of the scenes."""

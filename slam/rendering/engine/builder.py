@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,6 +29,7 @@ class Part:
         instance: id of the object it belongs to, 0 for background.
         flat: whether the triangles are one parallelogram over the whole texture.
         shines: emits light itself (screens, windows, lamps).
+        light: (T, 3) light at the corners of the triangles once it is baked, None before.
     """
 
     shape: Shape
@@ -36,6 +37,7 @@ class Part:
     instance: int
     flat: bool
     shines: bool
+    light: Array | None = None
 
 
 class SceneBuilder:
@@ -47,7 +49,7 @@ class SceneBuilder:
 
     def __init__(self, seed: int, detail: float = 1.0) -> None:
         """``detail`` scales the number of texels per metre of everything."""
-        self._detail = detail
+        self.detail = detail
         self.rng = np.random.default_rng(seed)
         self.parts: list[Part] = []
         self.categories: list[str] = []
@@ -131,7 +133,20 @@ class SceneBuilder:
         shape = shape.moved(self._T_world_object)
         self.parts.append(Part(shape, texture, self._instance, flat=False, shines=False))
 
+    def repeat(self, other: SceneBuilder) -> None:
+        """Add all of another builder, whose light is baked: as new instances of the same look.
+
+        However often it is repeated, its textures are stored once (see ``scene.build_scene``).
+        """
+        first, T = len(self.categories), self._T_world_object
+        self.categories += other.categories
+        self.frames += [T @ frame for frame in other.frames]
+        for part in other.parts:
+            instance = part.instance + first if part.instance else self._instance
+            moved = replace(part, shape=part.shape.moved(T), instance=instance)
+            self.parts.append(moved)
+
     def _paint(self, painter: Painter, width_m: float, height_m: float, px_per_m: float) -> Image:
-        px_per_m *= self._detail
+        px_per_m *= self.detail
         rows, columns = (max(4, round(m * px_per_m)) for m in (height_m, width_m))
         return painter(rows, columns, px_per_m, np.random.default_rng(self.rng.integers(2**63)))

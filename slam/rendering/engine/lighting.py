@@ -6,7 +6,7 @@ surfaces, at no cost per frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -57,29 +57,36 @@ def _from_lamp(lamp: Lamp, centre: Array, points: Array, normals: Array) -> Arra
     return lamp.power * np.maximum(cosine, 0) / (0.5 + distance2)
 
 
-def bake(parts: list[Part], lighting: Lighting, seed: int) -> tuple[list[Image], list[Array]]:
-    """Lit textures of the flat parts, and the light at the corners (T, 3) of every part."""
+def bake(parts: list[Part], lighting: Lighting, seed: int) -> list[Part]:
+    """The parts with their light: in the textures of flat ones, at the corners of others.
+
+    Parts whose light is baked already stay as they are, and cast shadows.
+    """
+    dark = [part for part in parts if part.light is None]
+    if not dark:
+        return parts
     scene = _scene(parts)
-    grids = [_grid(part) for part in parts]
+    grids = [_grid(part) for part in dark]
     points = np.concatenate([g[0] for g in grids])
     normals = np.concatenate([g[1] for g in grids])
     light = _gather(scene, lighting, points, normals, np.random.default_rng(seed))
-    textures: list[Image] = []
-    corners: list[Array] = []
-    first = 0
-    for part, (points_part, _, shape) in zip(parts, grids, strict=True):
-        own = light[first : first + len(points_part)].reshape(shape)
-        first += len(points_part)
-        if part.shines:
-            textures.append(part.texture)
-            corners.append(np.ones((len(part.shape.corners), 3)))
-        elif part.flat:
-            textures.append(_lit(part.texture, own))
-            corners.append(np.ones((len(part.shape.corners), 3)))
-        else:
-            textures.append(part.texture)
-            corners.append(own)
-    return textures, corners
+    ends = np.cumsum([len(grid[0]) for grid in grids])
+    own = iter(np.split(light, ends[:-1]))
+    shapes = iter([grid[2] for grid in grids])
+    return [
+        _with_light(part, next(own).reshape(next(shapes))) if part.light is None else part
+        for part in parts
+    ]
+
+
+def _with_light(part: Part, light: Array) -> Part:
+    """The part with the light of its ``_grid``."""
+    everywhere = np.ones((len(part.shape.corners), 3))
+    if part.shines:
+        return replace(part, light=everywhere)
+    if part.flat:
+        return replace(part, texture=_lit(part.texture, light), light=everywhere)
+    return replace(part, light=light)
 
 
 def _scene(parts: list[Part]) -> Any:

@@ -19,7 +19,6 @@ SWEEP = np.array(
 )
 """Amplitudes [rad, m] and frequencies [Hz] of a motion for calibration, added to the path: tilt,
 pan and roll about x, y and z, then translation along them."""
-_FINE = 4000
 
 
 @dataclass(frozen=True)
@@ -31,12 +30,14 @@ class CameraPath:
         targets_world: (N, 3) points looked at.
         speed_m_s: walking speed; slower where the turn would exceed ``turn_deg_s``.
         turn_deg_s: largest turn rate.
+        samples: number of equal shares of the curve for which its speed is found.
     """
 
     eyes_world: Array
     targets_world: Array
     speed_m_s: float = 0.42
     turn_deg_s: float = 26.0
+    samples: int = 4000
 
 
 def look_at(eyes: Array, targets: Array) -> Array:
@@ -65,7 +66,7 @@ def camera_poses(
 def steady_poses(path: CameraPath, times_s: Array) -> Array:
     """Poses T_world_camera (N, 4, 4) along the path at times (N,), without tremor."""
     shares_s = _share_times_s(path)
-    share = np.interp(_eased(times_s, shares_s[-1]), shares_s, np.linspace(0, 1, _FINE))
+    share = np.interp(_eased(times_s, shares_s[-1]), shares_s, np.linspace(0, 1, path.samples))
     return _at(path, share)
 
 
@@ -75,8 +76,8 @@ def duration_s(path: CameraPath) -> float:
 
 
 def _share_times_s(path: CameraPath) -> Array:
-    """The time at which each of _FINE equal shares of the path is reached."""
-    fine = _at(path, np.linspace(0, 1, _FINE))
+    """The time at which each of the equal shares of the path is reached."""
+    fine = _at(path, np.linspace(0, 1, path.samples))
     step_m = np.linalg.norm(np.diff(fine[:, :3, 3], axis=0), axis=1)
     relative = np.swapaxes(fine[:-1, :3, :3], 1, 2) @ fine[1:, :3, :3]
     step_deg = np.rad2deg(np.linalg.norm(so3_log(relative), axis=1))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.rendering.engine.atlas import Atlas, build_atlas
 from bmask_slam.rendering.engine.builder import Part, SceneBuilder
 from bmask_slam.rendering.engine.lighting import Lighting, bake
@@ -33,21 +33,29 @@ class Scene:
 
 
 def build_scene(builder: SceneBuilder, lighting: Lighting, moving: list[Part], seed: int) -> Scene:
-    """Bake the light and pack the textures."""
-    parts = builder.parts
-    textures, lights = bake(parts, lighting, seed)
+    """Bake the light and pack the textures, those of repeated parts once."""
+    parts = bake(builder.parts, lighting, seed)
+    places: dict[int, int] = {}  # in the atlas, by the identity of the array
+    rows = [places.setdefault(id(part.texture), len(places)) for part in parts]
+    textures = list({id(part.texture): part.texture for part in parts}.values())
     atlas = build_atlas(textures + [part.texture for part in moving])
-    static = assemble(parts, lights, 0)
-    return Scene(atlas, static, tuple(builder.categories), tuple(moving), len(parts))
+    static = assemble(parts, np.array(rows))
+    return Scene(atlas, static, tuple(builder.categories), tuple(moving), len(textures))
 
 
-def assemble(parts: list[Part], lights: list[Array], first_texture: int) -> Geometry:
-    """One geometry of many parts, whose textures follow each other in the atlas."""
+def assemble(parts: list[Part], textures: Ints) -> Geometry:
+    """One geometry of lit parts with these textures (N,) of the atlas."""
     counts = [len(part.shape.corners) for part in parts]
     return build_geometry(
         np.concatenate([part.shape.corners for part in parts]),
         np.concatenate([part.shape.uvs for part in parts]),
-        np.concatenate(lights),
-        np.repeat(np.arange(len(parts)) + first_texture, counts),
+        np.concatenate([_light(part) for part in parts]),
+        np.repeat(textures, counts),
         np.repeat([part.instance for part in parts], counts),
     )
+
+
+def _light(part: Part) -> Array:
+    """The light (T, 3) of a part that is lit."""
+    assert part.light is not None
+    return part.light

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -135,16 +135,15 @@ class Cast:
     def geometry(self, time_s: float, scene: Scene) -> Geometry:
         """All bodies as they are at a time, lit without cast shadows."""
         poses = [person.bones(time_s) for person in self.people]
-        placed, lights = [], []
+        placed = []
         for part, (who, bone) in zip(self.parts, self.owners, strict=True):
             shape = part.shape.moved(poses[who][bone])
-            placed.append(Part(shape, part.texture, part.instance, part.flat, part.shines))
             light = np.ones(shape.corners.shape[:2])
             if not part.shines:
                 points, normals = shape.corners.reshape(-1, 3), shape.normals.reshape(-1, 3)
                 light = irradiance(self.lighting, points, normals).reshape(light.shape)
-            lights.append(light)
-        return assemble(placed, lights, scene.first_moving_texture)
+            placed.append(replace(part, shape=shape, light=light))
+        return assemble(placed, scene.first_moving_texture + np.arange(len(placed)))
 
 
 def add_people(

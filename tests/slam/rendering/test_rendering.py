@@ -375,6 +375,7 @@ def test_scenes_are_listed_without_open3d() -> None:
         "crowded_office",
         "living_room",
         "corridor",
+        "building",
         "room",
     }
     code = "import sys, bmask_slam.rendering.sequence; assert 'open3d' not in sys.modules"

@@ -1,0 +1,124 @@
+"""A rendered building of three storeys: is the cost flat, and is no room taken for another?
+
+    python -m benchmarks.scale.building [--work runs/bench/building] [--fps 30] [--width 640]
+
+The building is rendered once (20 000 frames of 640x480 take hours and 12 GB of disk; fewer and
+smaller ones are a thinner version of the same walk) and run with `--segmenter none`, loops closed
+and not. A closed loop is wrong if its keyframes were further apart than ``APART_M`` in truth: rooms
+that look alike are 3.2 m and more apart. Times are of this machine; what counts is that they stay.
+"""
+
+from __future__ import annotations
+
+import argparse
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.suite.recorded_run import RecordingSystem
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.trajectory import associate_stamps, read_tum
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.run_folder.reader import Run
+from bmask_slam.system_config import SystemConfig
+
+PARTS = 10
+APART_M = 2.5
+COLUMNS = (
+    *("frames", "path_m", "keyframes", "landmarks", "in_graph", "factors"),
+    *("frame_ms", "p95_ms", "update_ms", "p95_ms", "rss_mb"),
+)
+
+
+def sequence_of(work: Path, fps: float, width: int) -> Path:
+    """The rendered building, made where it is not there yet."""
+    folder = work / f"building-{fps:g}hz-{width}"
+    if not folder.is_dir():
+        height = width * 3 // 4
+        render_sequence(RenderConfig("building", fps=fps, width=width, height=height), folder)
+    return folder
+
+
+def recorded(sequence: Path, out: Path, closed: bool) -> RecordingSystem:
+    """The system of a run by default options but for the segmenter and perhaps loops."""
+    settings = ("semantics.segmenter.name=none", f"loops.enabled={str(closed).lower()}")
+    systems: list[RecordingSystem] = []
+
+    def make_system(*given: Any) -> RecordingSystem:
+        systems[:] = [RecordingSystem(*given)]  # a run may begin anew
+        return systems[0]
+
+    config = resolve(SystemConfig, None, settings)
+    run(RunOptions(sequence, config, out=out, overwrite=True, quiet=True), make_system)
+    return systems[0]
+
+
+def table(out: Path, rows: list[dict[str, float]], walked_m: Array) -> str:
+    """Sizes at the end of each part of the sequence, and times within it."""
+    frames = Run(out).frames
+    total_ms = np.nansum(list(frames.stage_ms.values()), axis=0)
+    at = np.array([row["frame"] for row in rows])
+    lines = ["".join(f"{name:>10}" for name in COLUMNS)]
+    ends = np.linspace(0, len(frames), PARTS + 1).astype(int)
+    for begin, end in pairwise(ends.tolist()):
+        part = [row for row, frame in zip(rows, at, strict=True) if begin <= frame < end]
+        updates = np.array([row["update_ms"] for row in part])
+        last = part[-1]
+        values = (
+            *(end, walked_m[end - 1], last["keyframes"], last["landmarks"]),
+            *(last["graph_landmarks"], last["factors"]),
+            *(np.median(total_ms[begin:end]), np.percentile(total_ms[begin:end], 95)),
+            *(np.median(updates), np.percentile(updates, 95), last["rss_mb"]),
+        )
+        lines.append("".join(f"{value:10.0f}" for value in values))
+    return "\n".join(lines)
+
+
+def loops_apart_m(system: RecordingSystem, out: Path, sequence: Path) -> Array:
+    """How far apart the keyframes of each closed loop were in truth, (N,) in metres."""
+    frames, truth = Run(out).frames, read_tum(sequence / "groundtruth.txt")
+    is_keyframe = frames.keyframe_ids >= 0
+    stamps = frames.timestamps_s[is_keyframe]
+    rows, matched = associate_stamps(stamps, truth.timestamps_s)
+    ids = frames.keyframe_ids[is_keyframe][rows].tolist()
+    place = dict(zip(ids, truth.positions_world[matched], strict=True))
+    ends = system.mapper.loops.closed
+    return np.array([float(np.linalg.norm(place[a] - place[b])) for a, b in ends])
+
+
+def main() -> None:
+    """Render, run with and without loops, print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--work", type=Path, default=Path("runs/bench/building"))
+    parser.add_argument("--fps", type=float, default=30.0)
+    parser.add_argument("--width", type=int, default=640)
+    arguments = parser.parse_args()
+    sequence = sequence_of(arguments.work, arguments.fps, arguments.width)
+    positions = read_tum(sequence / "groundtruth.txt").positions_world
+    steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    walked_m = np.r_[0.0, np.cumsum(steps_m)]
+    print(f"{len(positions)} frames, {walked_m[-1]:.0f} m")
+    for closed in (True, False):
+        out = sequence.with_name(f"{sequence.name}-{'closed' if closed else 'open'}")
+        system = recorded(sequence, out, closed)
+        metrics = Run(out).metrics
+        ate_m = metrics["ate_rmse"].value
+        apart_m = loops_apart_m(system, out, sequence)
+        size_mb = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6
+        print(f"\nloops {'closed' if closed else 'not closed'}")
+        print(table(out, system.rows, walked_m))
+        print(
+            f"tracked {100 * metrics['tracked_share'].value:.2f} %, "
+            f"ATE {1e3 * ate_m:.0f} mm ({100 * ate_m / walked_m[-1]:.3f} % of the path), "
+            f"loops {len(apart_m)}, wrong ones {np.count_nonzero(apart_m > APART_M)}, "
+            f"run folder {size_mb:.0f} MB",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
