@@ -22,7 +22,7 @@ from bmask_slam.system_config import SystemConfig
 CONFIG = resolve(
     SystemConfig, None, ("semantics.segmenter.name=none", "features.max_keypoints=400")
 )
-FRAMES, FPS = 100, 15.0
+FRAMES, FPS = 70, 15.0
 
 
 @pytest.fixture(scope="module")
