@@ -96,7 +96,7 @@ def test_lost_frames_get_no_pose_and_tracking_recovers() -> None:
 def test_segments_are_kept_apart_until_one_is_recognised_in_the_other() -> None:
     system = SlamSystem(CAMERA, SystemConfig(FeatureConfig(max_keypoints=400)))
     here, other_path = path(12, start_x_m=-1.6), path(14, start_x_m=1.4)
-    back = [path(1, start_x_m=x)[0] for x in np.arange(1.4, -1.61, -0.03)]
+    back = [path(1, start_x_m=x)[0] for x in np.arange(1.4, -1.61, -0.045)]
     poses = [*here, *[None] * 11, *other_path]
     results = process_views(system, poses)
     assert results[-1].segment == 1
