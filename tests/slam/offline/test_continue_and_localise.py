@@ -206,7 +206,9 @@ def test_real_frames_continue_and_are_localised_in_one_frame(tmp_path: Path) -> 
     second = cut_out(tmp_path / "second", range(18, 36))
     run(RunOptions(second, CONFIG, out=tmp_path / "new", map=tmp_path / "old", quiet=True))
     small = cut_out(tmp_path / "small", range(3, 24, 3), margin_px=40)
-    run(RunOptions(small, CONFIG, out=tmp_path / "found", localise=tmp_path / "old/map", quiet=True))
+    run(
+        RunOptions(small, CONFIG, out=tmp_path / "found", localise=tmp_path / "old/map", quiet=True)
+    )
     truth = read_tum(KITCHEN / "groundtruth.txt")
     start = inverse(truth.poses_world_camera[0])
     for name, stamps in (("new", second), ("found", small)):
