@@ -201,7 +201,7 @@ _Tables = tuple[Floats, NDArray[np.int32], NDArray[np.int32]]
 _Hits = tuple[Floats, Ints, Floats]
 
 
-def _product(a: Floats, b: Floats) -> Floats:
+def _product(a: NDArray[Any], b: NDArray[Any]) -> Floats:
     """The inner products (N,) of vectors in columns, (3, N): quicker than of rows."""
     found: Floats = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     return found
