@@ -190,7 +190,8 @@ def judged(
     differs = any(estimate.differs(i, config) for i in free)
     verdict = "not sure enough to be applied" if differs else "the camera keeps it"
     text = format_found(estimate, seen, verdict) if seen else UNOBSERVABLE
-    settled = len(seen) == np.count_nonzero(estimate.sigmas[list(free)]) and not differs
+    looked_for = np.count_nonzero(estimate.sigmas[list(free)])
+    settled = bool(len(seen) == looked_for and not differs)
     looks = state.looks + 1
     return dataclasses.replace(state, text=text, looks=looks, settled=settled)
 

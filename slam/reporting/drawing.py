@@ -31,13 +31,14 @@ def figure(width_in: float, height_in: float) -> Iterator[Figure]:
         yield Figure(figsize=(width_in, height_in), layout="constrained")
 
 
-def as_picture(drawn: Figure, title: str, caption: str) -> Picture:
-    """The figure as SVG and PDF; the same figure gives the same bytes."""
+def as_picture(drawn: Figure, title: str, caption: str, for_paper: bool = False) -> Picture:
+    """The figure as SVG, and for a paper also as PDF; the same figure gives the same bytes."""
     svg, pdf = io.BytesIO(), io.BytesIO()
     with matplotlib.rc_context(STYLE):
         drawn.savefig(svg, format="svg", metadata={"Date": None}, transparent=True)
-        drawn.set_layout_engine("none")  # use the layout of the SVG in the PDF too
-        drawn.savefig(pdf, format="pdf", metadata={"CreationDate": None})
+        if for_paper:
+            drawn.set_layout_engine(None)  # the layout of the SVG; "none" would draw it twice
+            drawn.savefig(pdf, format="pdf", metadata={"CreationDate": None})
     width_in, height_in = drawn.get_size_inches()
     size_px = (96 * width_in, 96 * height_in)
-    return Picture(title, caption, svg.getvalue(), SVG, size_px, pdf.getvalue())
+    return Picture(title, caption, svg.getvalue(), SVG, size_px, pdf.getvalue() or None)

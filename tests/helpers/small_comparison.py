@@ -5,9 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind, Method
 from bmask_slam.graph.trajectory import Trajectory, write_tum
+from bmask_slam.reporting.drawing import SVG
+from bmask_slam.reporting.parts import Picture
 
 HOSTILE = "<script>alert('x')</script> & 50%_{\\input{a}} `|#~^"
 FAILED_LOG = "first line\n" + "noise\n" * 100 + "Killed <b>here</b> & there"
@@ -44,6 +47,11 @@ def make_comparison(folder: Path, hostile: str = HOSTILE) -> Comparison:
     provenance = {"commit": "abc123def", "versions": {"numpy": "2.9.9"}, "command": "compare <x>"}
     title = "Small & <odd>"
     return Comparison("small", title, "Of $5", ("one", "two_x"), methods, cells, provenance)
+
+
+def unsaved(drawn: Figure, title: str, caption: str, for_paper: bool) -> Picture:
+    """In place of ``as_picture``: the fonts of a PDF take a second."""
+    return Picture(title, caption, b"<svg/>", SVG, (8.0, 8.0), b"%PDF")
 
 
 def circle(wave_m: float) -> Trajectory:

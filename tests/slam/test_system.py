@@ -12,6 +12,7 @@ from synthetic_view import CAMERA, render_or_black, render_plane
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.events import EventKind
+from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
@@ -93,9 +94,9 @@ def test_lost_frames_get_no_pose_and_tracking_recovers() -> None:
 
 
 def test_segments_are_kept_apart_until_one_is_recognised_in_the_other() -> None:
-    system = SlamSystem(CAMERA)
+    system = SlamSystem(CAMERA, SystemConfig(FeatureConfig(max_keypoints=400)))
     here, other_path = path(12, start_x_m=-1.6), path(14, start_x_m=1.4)
-    back = [path(1, start_x_m=x)[0] for x in np.arange(1.4, -1.61, -0.03)]
+    back = [path(1, start_x_m=x)[0] for x in np.arange(1.4, -1.61, -0.045)]
     poses = [*here, *[None] * 11, *other_path]
     results = process_views(system, poses)
     assert results[-1].segment == 1

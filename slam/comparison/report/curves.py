@@ -58,7 +58,7 @@ def curve_picture(title: str, caption: str, curves: Curves, names: tuple[str, st
         axes.set(yscale="log") if names[1] == "loss" else axes.set(xlim=(0, 1), ylim=(0, 1.02))
         axes.grid()
         axes.legend()
-        return as_picture(drawn, title, caption)
+        return as_picture(drawn, title, caption, for_paper=True)
 
 
 def read_losses(path: Path) -> Curves:

@@ -110,7 +110,8 @@ def error_picture(method: Method, errors: Errors, scales: Scales) -> Picture:
         f"{len(errors.truth)} poses{scale}; {'each' if step == 1 else f'1 in {step}'} of the "
         f"differences drawn{larger}. Below: relative translation error over a second."
     )
-    return as_picture(drawn, f"{method.name} on {cell.sequence}", caption)
+    title = f"{method.name} on {cell.sequence}"
+    return as_picture(drawn, title, caption, for_paper=True)
 
 
 def draw_path(axes: Axes, errors: Errors, enlarged: int) -> int:

@@ -62,16 +62,17 @@ def _mip_levels(texture: Image) -> list[Image]:
     return levels
 
 
-def sample(atlas: Atlas, texture: NDArray[np.integer], uv: Floats, level: Floats) -> Floats:
-    """Bilinear look-up: colours (N, 3) float32 at uv (N, 2) in [0, 1] of mip ``floor(level)``."""
+def sample(atlas: Atlas, texture: NDArray[np.integer], uv: list[Floats], level: Floats) -> Image:
+    """Bilinear look-up: colours (N, 3) at u and v (N,) in [0, 1] of mip ``floor(level)``."""
     slot = texture * _LEVELS + np.clip(level, 0, _LEVELS - 1).astype(np.int32)
-    place = atlas.slots.take(slot, axis=0)
-    where = np.minimum(np.maximum(uv, 0), 1)
-    where *= place[:, 2:]
-    where += place[:, :2]
-    where -= np.float32(0.5)
-    n = len(where)
-    lanes = np.zeros((-(-n // _LANE), _LANE, 2), np.float32)
-    lanes.reshape(-1, 2)[:n] = where
-    colours = cv2.remap(atlas.image, lanes[..., 0], lanes[..., 1], cv2.INTER_LINEAR)
-    return colours.reshape(-1, 3)[:n].astype(np.float32)
+    place = np.ascontiguousarray(atlas.slots.take(slot, axis=0).T)
+    n = len(slot)
+    lanes = np.zeros((2, -(-n // _LANE), _LANE), np.float32)
+    for lane, along, first, size in zip(lanes, uv, place[:2], place[2:], strict=True):
+        where = np.minimum(np.maximum(along, 0), 1)
+        where *= size
+        where += first
+        where -= np.float32(0.5)
+        lane.reshape(-1)[:n] = where
+    colours: Image = cv2.remap(atlas.image, *lanes, cv2.INTER_LINEAR)
+    return colours.reshape(-1, 3)[:n]

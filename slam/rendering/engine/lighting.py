@@ -152,6 +152,7 @@ def _open_sky(scene: Any, start: Array, normals: Array, rng: np.random.Generator
 
 def _blocked(scene: Any, start: Array, direction: Array, reach: float) -> Mask:
     o3d = load_open3d()
-    rays = np.concatenate([start, direction], axis=1).astype(np.float32)
+    rays = np.empty((len(start), 6), np.float32)
+    rays[:, :3], rays[:, 3:] = start, direction
     blocked: Mask = scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=reach).numpy()
     return blocked

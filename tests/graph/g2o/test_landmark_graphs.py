@@ -107,23 +107,32 @@ def test_reference_frames_are_numbered_behind_the_keyframes(tmp_path: Path) -> N
 def test_the_cost_equals_g2os(file: Path) -> None:
     """EdgeSE3PointXYZDisparity in g2o's source: p = K T^-1 x, e = (px/pz, py/pz, 1/pz) - z."""
     lines = [line.split() for line in file.read_text().splitlines() if line[0] != "#"]
-    numbers = {tag: [list(map(float, w[1:])) for w in lines if w[0] == tag] for tag, *_ in lines}
+    numbers = {
+        tag: [list(map(float, w[1:])) for w in lines if w[0] == tag]
+        for tag in {w[0] for w in lines}
+    }
     (camera,) = numbers["PARAMS_CAMERACALIB"]
     assert camera[:8] == [0, 0, 0, 0, 0, 0, 0, 1]
     fx, fy, cx, cy = camera[8:]
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    poses = {int(v[0]): (np.array(v[1:4]), np.array(v[4:])) for v in numbers["VERTEX_SE3:QUAT"]}
+    poses = {
+        int(v[0]): (np.array(v[1:4]), K @ rotation_from_quaternion(np.array(v[4:])).T)
+        for v in numbers["VERTEX_SE3:QUAT"]
+    }
     points = {int(v[0]): np.array(v[1:]) for v in numbers["VERTEX_TRACKXYZ"]}
     assert not set(poses) & set(points)
-    total = 0.0
-    for k, point, parameter, *values in numbers["EDGE_PROJECT_DISPARITY"]:
-        assert parameter == camera[0]
-        t, q = poses[int(k)]
-        p = K @ rotation_from_quaternion(q).T @ (points[int(point)] - t)
-        e = np.array([p[0] / p[2], p[1] / p[2], 1 / p[2]]) - values[:3]
-        omega = np.zeros((3, 3))
-        omega[np.triu_indices(3)] = values[3:]
-        total += float(e @ (omega + np.triu(omega, 1).T) @ e)
+    edges = np.array(numbers["EDGE_PROJECT_DISPARITY"])
+    assert (edges[:, 2] == camera[0]).all()
+    seen = []
+    for k, point in edges[:, :2].astype(int).tolist():
+        t, KR = poses[k]
+        seen.append(KR @ (points[point] - t))
+    px, py, pz = np.transpose(seen)
+    e = np.stack([px / pz, py / pz, 1 / pz], axis=1) - edges[:, 3:6]
+    omega = np.zeros((len(edges), 3, 3))
+    above = np.triu_indices(3)
+    omega[:, above[0], above[1]] = omega[:, above[1], above[0]] = edges[:, 6:]
+    total = np.einsum("ni,nij,nj->", e, omega, e)
     tables = room_graph()
     observations = tables.observations.all()
     chi2 = reprojection(observations, *tables.values_of(observations), CAMERA)[1]

@@ -23,7 +23,10 @@ from bmask_slam.live.processes.map_process import MapServer
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 
-SETTINGS = ["keyframes.min_interval_frames=1", "keyframes.max_shared=2.0"]
+SETTINGS = [
+    *("keyframes.min_interval_frames=1", "keyframes.max_shared=2.0"),
+    "features.max_keypoints=300",
+]
 CONFIG = resolve(SystemConfig, None, [*SETTINGS, "keyframes.late_shared=2.0"])
 FIRM = gtsam.noiseModel.Isotropic.Sigma(3, 1e-5)
 OFF_M = np.array([0.05, -0.02, 0.03])

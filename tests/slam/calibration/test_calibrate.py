@@ -161,7 +161,7 @@ def test_two_rounds_rerun_with_the_found_camera(
     wrong = dataclasses.replace(truth, fx=truth.fx * 1.03, fy=truth.fy * 1.03)
     write_camera(tmp_path / "wrong.yaml", wrong)
     options = ["--camera", str(tmp_path / "wrong.yaml"), "--segmenter", "none", "--quiet"]
-    options += ["--calibrate", "off", "--max-frames", "50"]
+    options += ["--calibrate", "off", "--max-frames", "40", "--set", "features.max_keypoints=400"]
     assert cli.main(["run", str(sequence), *options, "--out", str(run)]) == 0
     before = sorted(path.name for path in run.iterdir())
     assert cli.main(["calibrate", str(run), "--reference", str(sequence), "--rounds", "0"]) == 1

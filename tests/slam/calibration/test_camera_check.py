@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ import pytest
 from bmask_slam.calibration.camera_check import CameraCheck, check_camera
 from bmask_slam.calibration.edge_scores import correlation, edges_of
 from bmask_slam.config.configuration import resolve
+from bmask_slam.evaluation import plot
 from bmask_slam.graph.camera import Camera
 from bmask_slam.offline.runner import RunOptions, RunSummary, run
 from bmask_slam.run_folder.map_file import read_run
@@ -22,7 +24,14 @@ from bmask_slam.system_config import SystemConfig
 CONFIG = resolve(
     SystemConfig, None, ("semantics.segmenter.name=none", "features.max_keypoints=400")
 )
-FRAMES, FPS = 100, 15.0
+FRAMES, FPS = 70, 15.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_plots() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plot, "plot_trajectory", lambda path, *_: path.write_text("quick"))
+        yield
 
 
 @pytest.fixture(scope="module")

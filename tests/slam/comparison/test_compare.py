@@ -12,10 +12,12 @@ from pathlib import Path
 
 import pytest
 from repository import ROOT
+from small_comparison import unsaved
 
 from bmask_slam.cli import main
 from bmask_slam.comparison import CellStatus, CompareOptions, Comparison, compare, read_results
 from bmask_slam.comparison.jobs.job import environment
+from bmask_slam.comparison.report import figures
 from bmask_slam.comparison.text import format_comparison
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import se3_exp
@@ -52,7 +54,7 @@ def run_again(data: Path, out: Path) -> Comparison:
     return compare(data / "mine.yaml", out, options)
 
 
-def test_a_comparison_end_to_end(data, tmp_path):
+def test_a_comparison_end_to_end(data, tmp_path, monkeypatch):
     out = tmp_path / "out"
     found = compare(data / "mine.yaml", out, CompareOptions(quiet=True))
     cells = {cell.method: cell for cell in found.cells}
@@ -77,6 +79,7 @@ def test_a_comparison_end_to_end(data, tmp_path):
     assert "failed: office: broken" in text
     assert "2.00" in text
 
+    monkeypatch.setattr(figures, "as_picture", unsaved)
     record = out / "cells/office/default/0/cell.json"
     before = record.stat().st_mtime_ns
     assert run_again(data, out).cells[0] == found.cells[0]
@@ -88,8 +91,9 @@ def test_a_comparison_end_to_end(data, tmp_path):
     assert json.loads(record.read_text())["depends"]["code"] != "another"
 
 
-def test_a_failed_rendering_fails_only_its_cells(data, tmp_path):
+def test_a_failed_rendering_fails_only_its_cells(data, tmp_path, monkeypatch):
     """The office has fewer frames; a rendered room's trajectory is evaluated against its truth."""
+    monkeypatch.setattr(figures, "as_picture", unsaved)
     text = EXPERIMENT.partition("  broken")[0].replace(
         "sequences: {office: office}",
         "sequences: {office: office, long: {render: {name: office, frames: 9999, width: 160}}}",
@@ -167,6 +171,7 @@ def test_a_killed_and_an_interrupted_comparison_are_resumed(data, tmp_path):
 
 
 def test_a_missing_sequence_does_not_affect_the_others(tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "as_picture", unsaved)
     monkeypatch.chdir(tmp_path)
     truth = "".join(f"{k} {k % 3} {k % 5} {k % 7} 0 0 0 1\n" for k in range(10))
     (tmp_path / "freiburg1_xyz-groundtruth.txt").write_text(truth)
@@ -186,6 +191,7 @@ SHARED = ROOT / "../shared/data/trajectories"
 @pytest.mark.parametrize("given", ["data", "trajectory"])
 def test_rgbd_slam_on_freiburg1_xyz(given, tmp_path, monkeypatch):
     """The shipped experiment prints 1.35 cm; truth is found beside the trajectory."""
+    monkeypatch.setattr(figures, "as_picture", unsaved)
     monkeypatch.chdir(tmp_path)
     row = "RGB-D SLAM (run)"
     file = SHARED / "freiburg1_xyz-rgbdslam.txt"

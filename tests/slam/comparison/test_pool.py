@@ -91,11 +91,11 @@ def test_threads_are_limited():
 
 
 def test_a_pool_runs_all_and_passes_on_failures(tmp_path):
-    good = [job(tmp_path, f"j{k}") for k in range(3)]
+    good = [job(tmp_path, f"j{k}") for k in range(2)]
     bad = job(tmp_path, "bad", "info", str(tmp_path / "nothing"))
     found = {j.name: outcome.status for j, outcome in LocalPool(2).run([*good, bad])}
     done, failed = CellStatus.DONE, CellStatus.FAILED
-    assert found == {"j0": done, "j1": done, "j2": done, "bad": failed}
+    assert found == {"j0": done, "j1": done, "bad": failed}
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks into /proc")

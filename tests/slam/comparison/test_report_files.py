@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from small_comparison import make_comparison
+from small_comparison import make_comparison, unsaved
 
 from bmask_slam.comparison.experiment.result import Comparison
-from bmask_slam.comparison.report import write_report
+from bmask_slam.comparison.report import figures, write_report
 from bmask_slam.comparison.report.curves import network_pictures, read_losses, read_precision
 from bmask_slam.comparison.report.run_files import event_table, map_pictures, stage_table
 from bmask_slam.run_folder.frame_file import COLUMNS, STAGES
@@ -53,7 +53,8 @@ def test_without_run_folders_there_is_no_stage_table(comparison, tmp_path):
     assert stage_table(comparison, tmp_path) is None
 
 
-def test_events_are_counted_by_kind_as_a_mean_over_runs(comparison, tmp_path):
+def test_events_are_counted_by_kind_as_a_mean_over_runs(comparison, tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "as_picture", unsaved)
     assert event_table(comparison, "one", tmp_path) is None
     lost = '3,0.1,lost,"7 matches give no pose, nor is it recognised"\n'
     for k, count in enumerate((2, 1)):
@@ -122,7 +123,8 @@ def test_networks_are_drawn_in_one_figure(comparison, tmp_path, caplog):
     assert "precision_recall.csv" in caplog.text
 
 
-def test_drawings_are_kept_as_files_and_old_ones_removed(comparison, tmp_path):
+def test_drawings_are_kept_as_files_and_old_ones_removed(comparison, tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "as_picture", unsaved)
     first = {p.name for p in write_report(comparison, tmp_path) if p.parent.name == "figures"}
     assert "default-on-one.pdf" in first
     write_report(replace(comparison, sequences=("two_x",)), tmp_path)

@@ -16,6 +16,7 @@ from test_semantic_mapper import (
 )
 
 from bmask_slam.labelling import remembered_masks
+from bmask_slam.labelling.landmark_votes import LabelVotes
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 
@@ -38,9 +39,20 @@ def test_keyframes_vote_on_landmarks_made_later(monkeypatch: pytest.MonkeyPatch)
     assert min(shares.values()) > 0.995
 
 
-def test_what_is_remembered_outlives_a_state_and_older_states_lack_surfaces() -> None:
-    votes = run(Sides(FRAMES), MANY_KEYFRAMES).semantics._label_votes
-    state = votes.state()
+@pytest.fixture(scope="module")
+def labelled() -> SlamSystem:
+    """A run whose masks are remembered; not to be changed."""
+    return run(Sides(FRAMES), MANY_KEYFRAMES)
+
+
+def other_votes() -> LabelVotes:
+    return SlamSystem(CAMERA, SystemConfig(), Sides(FRAMES)).semantics._label_votes
+
+
+def test_what_is_remembered_outlives_a_state_and_older_states_lack_surfaces(
+    labelled: SlamSystem,
+) -> None:
+    state, votes = labelled.semantics._label_votes.state(), other_votes()
     assert len(state["coded"]) == len(state["keyframes"]) > 1
     votes.restore(state)
     again = votes.state()
@@ -55,11 +67,10 @@ def test_what_is_remembered_outlives_a_state_and_older_states_lack_surfaces() ->
     np.testing.assert_array_equal(votes.state()["owner"], state["owner"])
 
 
-def test_masks_that_an_older_version_kept_whole_are_thinned() -> None:
+def test_masks_that_an_older_version_kept_whole_are_thinned(labelled: SlamSystem) -> None:
     """A state of both sizes could not be saved."""
-    system = run(Sides(FRAMES), MANY_KEYFRAMES)
-    votes, height, width = system.semantics._label_votes, CAMERA.height, CAMERA.width
-    state = votes.state()
+    state, votes = labelled.semantics._label_votes.state(), other_votes()
+    height, width = CAMERA.height, CAMERA.width
     count, (h, w) = len(state["keyframes"]), state["shape"][:2]
     older = {n: a for n, a in state.items() if not n.startswith(("cod", "cell"))}
     for name in ("owner", "under", "inner"):
@@ -70,9 +81,8 @@ def test_masks_that_an_older_version_kept_whole_are_thinned() -> None:
     np.testing.assert_array_equal(votes.state()["owner"], state["owner"])
 
 
-def test_a_map_of_an_older_version_lacks_the_surfaces_of_masks() -> None:
-    system = run(Sides(FRAMES), MANY_KEYFRAMES)
-    state = {n: a for n, a in system.state().items() if "semantics.votes.code" not in n}
+def test_a_map_of_an_older_version_lacks_the_surfaces_of_masks(labelled: SlamSystem) -> None:
+    state = {n: a for n, a in labelled.state().items() if "semantics.votes.code" not in n}
     del state["semantics.votes.cell_px"]
     again = SlamSystem(CAMERA, SystemConfig())
     again.restore(state, FILE)

@@ -26,7 +26,7 @@ FILE = Path("run/checkpoint")
 EDGE_M = 0.1  # world x: left of it on the plane is one thing, right of it another
 MANY_KEYFRAMES = [  # and most of them culled again
     *("keyframes.min_interval_frames=1", "keyframes.max_shared=2.0"),
-    *("mapping.redundant_share=0.3", "mapping.redundant_views=2"),
+    *("mapping.redundant_share=0.3", "mapping.redundant_views=2", "features.max_keypoints=400"),
 ]
 
 
@@ -68,7 +68,7 @@ class Sides:
         return Segmented(found, SurfaceClasses(label_set(("wall", "door")), p, 8.0, left.shape))
 
 
-FRAMES = frames(10)
+FRAMES = frames(8)
 
 
 def run(segmenter: Sides, settings: list[str] | None = None) -> SlamSystem:

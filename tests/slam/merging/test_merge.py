@@ -17,6 +17,7 @@ from synthetic_view import CAMERA, render_plane, sideways_path
 from bmask_slam import cli
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation import plot
+from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.graph.trajectory import read_tum
@@ -33,8 +34,10 @@ from bmask_slam.tracking.keyframe_decision import KeyframeConfig
 
 PLACE = se3_exp(np.array([0.0, 0.0, 0.3, 0.2, 0.1, 0.0]))
 """The second walk's camera is turned about its axis and begins elsewhere."""
-FIRST_M, SECOND_M = np.linspace(-1.7, -0.6, 12), np.linspace(-1.4, -0.3, 12)
+FRAMES = 9
+FIRST_M, SECOND_M = np.linspace(-1.7, -0.6, FRAMES), np.linspace(-1.4, -0.3, FRAMES)
 FAR_M = np.linspace(1.5, 1.7, 3)
+FEATURES = FeatureConfig(max_keypoints=400)
 OFTEN = KeyframeConfig(min_interval_frames=1, late_frames=2, late_shared=1.0)
 WALKS = {
     "first": sideways_path(FIRST_M),
@@ -50,7 +53,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plot, "plot_trajectory", lambda path, *_: path.write_text("quick"))
         for name, poses in WALKS.items():
-            system = SlamSystem(CAMERA, SystemConfig(keyframes=OFTEN))
+            system = SlamSystem(CAMERA, SystemConfig(FEATURES, keyframes=OFTEN))
             with RunFolder(folder / name) as run:
                 run.write_text("config.yaml", f"# bmask-slam 0, live\n{dump(system.config)}")
                 for index, T in enumerate(poses):
@@ -74,7 +77,7 @@ def test_both_walks_are_where_they_were_in_one_world(merged: MergeSummary) -> No
         errors = se3_log(inverse(true) @ found.poses_world_camera)
         assert np.abs(errors[:, 3:]).max() < 0.01
         assert np.abs(errors[:, :3]).max() < 0.005
-        assert found.timestamps_s == pytest.approx(np.arange(12) / 30, abs=1e-6)
+        assert found.timestamps_s == pytest.approx(np.arange(FRAMES) / 30, abs=1e-6)
 
 
 def test_what_both_saw_is_there_once(merged: MergeSummary, runs: Path) -> None:
@@ -109,7 +112,7 @@ def test_objects_of_map_segments_that_are_not_joined_stay_apart() -> None:
 def test_the_result_is_one_run(merged: MergeSummary, runs: Path) -> None:
     run = Run(merged.folder)
     first, second = (Run(runs / name) for name in ("first", "second"))
-    assert len(run.frames) == len(run.trajectory) == 24
+    assert len(run.frames) == len(run.trajectory) == 2 * FRAMES
     assert (np.diff(run.frames.index) == 1).all()
     made = run.frames.keyframe_ids[run.frames.keyframe_ids >= 0]
     assert len(made) == len(np.unique(made)) == len(first.keyframes) + len(second.keyframes)
@@ -134,20 +137,20 @@ def test_the_map_is_tracked_in_from_both_walks(merged: MergeSummary) -> None:
 def test_a_run_that_continued_another_is_merged(runs: Path, tmp_path: Path) -> None:
     """Keyframes of the recording that it continued are of another clock: they have no stamp."""
     state, camera = read_map(runs / "first")
-    system = SlamSystem(camera, SystemConfig(keyframes=OFTEN, covariances=True))
+    system = SlamSystem(camera, SystemConfig(FEATURES, keyframes=OFTEN, covariances=True))
     system.restore(state, runs / "first")
     system.begin_session()
     with pytest.MonkeyPatch.context() as patch, RunFolder(tmp_path / "continued") as run:
         patch.setattr(plot, "plot_trajectory", lambda path, *_: path.write_text("quick"))
         run.write_text("config.yaml", f"# bmask-slam 0, live\n{dump(system.config)}")
-        for index, T in enumerate(sideways_path(np.linspace(-1.5, -0.4, 12))):
+        for index, T in enumerate(sideways_path(np.linspace(-1.5, -0.4, FRAMES))):
             run.write_frame(system.process(render_plane(T, index)))
         system.finish()
         metrics.save(system, run, [], None, "continued")
         own = len(system.keyframe_trajectory())
         done = merge_runs(MergeOptions((run.path, runs / "second"), tmp_path / "both"))
     both, keyframes = Run(done.folder), len(Run(runs / "second").keyframes)
-    assert len(both.trajectory) == 24
+    assert len(both.trajectory) == 2 * FRAMES
     assert len(both.keyframes) == own + keyframes
     assert np.isfinite(both.keyframes.timestamps_s).all()
     kept = len(Run(runs / "first").keyframes) + own + keyframes

@@ -14,6 +14,7 @@ from synthetic_view import CAMERA, PLANE_Z_M, render_plane, sideways_path
 
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation import plot
+from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.features.marker_detection import draw_marker
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
@@ -39,6 +40,7 @@ from bmask_slam.tracking.keyframe_decision import KeyframeConfig
 
 SIZE_M = 0.2
 MARKERS = MarkersConfig(enabled=True, size_m=SIZE_M)
+FEATURES = FeatureConfig(max_keypoints=400)
 OFTEN = KeyframeConfig(min_interval_frames=1, late_frames=2, late_shared=1.0)
 
 
@@ -50,10 +52,10 @@ def on_the_plane(x_m: float, y_m: float) -> Array:
 PLACES = {4: on_the_plane(-1.0, 0.3), 9: on_the_plane(-2.6, -0.2), 2: on_the_plane(0.7, 0.1)}
 """The first is seen by both walks, the others by one each."""
 WALKS = {
-    "first": sideways_path(np.linspace(-1.7, -0.6, 12)),
+    "first": sideways_path(np.linspace(-1.7, -0.6, 8)),
     "second": [
         T @ se3_exp(np.array([0.0, 0.0, 0.3, 0.2, 0.1, 0.0]))
-        for T in sideways_path(np.linspace(-1.4, -0.3, 12))
+        for T in sideways_path(np.linspace(-1.4, -0.3, 8))
     ],
 }
 
@@ -84,7 +86,7 @@ def walk(
 ) -> Path:
     """The folder of a run of a walk past markers."""
     sensors = SensorsConfig(markers=config)
-    system = SlamSystem(CAMERA, SystemConfig(keyframes=OFTEN, sensors=sensors))
+    system = SlamSystem(CAMERA, SystemConfig(FEATURES, keyframes=OFTEN, sensors=sensors))
     with RunFolder(folder / name) as run:
         run.write_text("config.yaml", f"# bmask-slam 0, live\n{dump(system.config)}")
         for index, T in enumerate(WALKS[name]):

@@ -25,7 +25,10 @@ from bmask_slam.tracking.results import TrackingStatus
 
 CARD_Z_M = 1.3
 FRAMES = 36
-SETTINGS = ["keyframes.min_interval_frames=6", "keyframes.max_shared=2.0"]
+SETTINGS = [
+    *("keyframes.min_interval_frames=6", "keyframes.max_shared=2.0"),
+    "features.max_keypoints=500",
+]
 NAMES = label_set(("person", "picture", "dog"))
 
 

@@ -33,7 +33,7 @@ def sequence(tmp_path: Path) -> Path:
     return make_sequence(tmp_path / "seq")
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def quick_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plot, "plot_trajectory", lambda path, *_: path.write_text("quick"))
 
@@ -77,7 +77,6 @@ def kill_at_rename(monkeypatch: pytest.MonkeyPatch, number: int, after: bool) ->
     monkeypatch.setattr(os, "replace", fatal)
 
 
-@pytest.mark.usefixtures("quick_plots")
 def test_killed_at_every_rename_and_resumed(
     sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -103,7 +102,6 @@ def test_killed_at_every_rename_and_resumed(
             assert result(out) == expected
 
 
-@pytest.mark.usefixtures("quick_plots")
 @pytest.mark.parametrize("frame", [0, 5, 6, 7, 19])
 def test_killed_in_a_frame_twice_and_resumed(sequence: Path, tmp_path: Path, frame: int) -> None:
     run(options(sequence, tmp_path / "undisturbed", stride=2, max_frames=9), FakeSystem)

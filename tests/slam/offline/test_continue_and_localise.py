@@ -12,6 +12,7 @@ from fake_run import FakeSystem, make_sequence
 from repository import KITCHEN
 from synthetic_view import CAMERA, render_plane
 
+from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.graph.arrays import Array, Arrays
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import read_arrays, write_arrays
@@ -22,7 +23,10 @@ from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.run_folder.folder import FILES
 from bmask_slam.run_folder.map_file import MAP_FILE, read_map, write_map
 from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
+
+CONFIG = SystemConfig(FeatureConfig(max_keypoints=400))
 
 
 def sideways(count: int, start_x_m: float, step_m: float = 0.03) -> list[Array]:
@@ -40,14 +44,14 @@ def state() -> Arrays:
 
     Its frames begin at stamp 0, as those of every other session here do.
     """
-    system = SlamSystem(CAMERA)
+    system = SlamSystem(CAMERA, CONFIG)
     process_frames(system, sideways(20, -1.6))
     system.finish()
     return system.state()
 
 
 def started(state: Arrays, make: type[SlamSystem] = SlamSystem) -> SlamSystem:
-    system = make(CAMERA)
+    system = make(CAMERA, CONFIG)
     system.restore({name: array.copy() for name, array in state.items()}, Path("map"))
     system.begin_session()
     return system
@@ -196,13 +200,15 @@ def cut_out(folder: Path, frames: range, margin_px: int = 0) -> Path:
 
 @pytest.mark.skipif(not KITCHEN.is_dir(), reason="no ../shared/data/redkitchen here")
 def test_real_frames_continue_and_are_localised_in_one_frame(tmp_path: Path) -> None:
-    first = cut_out(tmp_path / "first", range(36))
-    run(RunOptions(first, out=tmp_path / "old", quiet=True))
+    first = cut_out(tmp_path / "first", range(24))
+    run(RunOptions(first, CONFIG, out=tmp_path / "old", quiet=True))
     saved = (tmp_path / "old/map").read_bytes()
-    second = cut_out(tmp_path / "second", range(30, 54))
-    run(RunOptions(second, out=tmp_path / "new", map=tmp_path / "old", quiet=True))
-    small = cut_out(tmp_path / "small", range(3, 33, 3), margin_px=40)
-    run(RunOptions(small, out=tmp_path / "found", localise=tmp_path / "old/map", quiet=True))
+    second = cut_out(tmp_path / "second", range(18, 36))
+    run(RunOptions(second, CONFIG, out=tmp_path / "new", map=tmp_path / "old", quiet=True))
+    small = cut_out(tmp_path / "small", range(3, 24, 3), margin_px=40)
+    run(
+        RunOptions(small, CONFIG, out=tmp_path / "found", localise=tmp_path / "old/map", quiet=True)
+    )
     truth = read_tum(KITCHEN / "groundtruth.txt")
     start = inverse(truth.poses_world_camera[0])
     for name, stamps in (("new", second), ("found", small)):

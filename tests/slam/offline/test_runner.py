@@ -21,6 +21,7 @@ from fake_run import FakeSystem, make_sequence, signal_at, true_trajectory
 from repository import ROOT, SHARED
 
 from bmask_slam.config.configuration import resolve
+from bmask_slam.evaluation import plot
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
@@ -49,6 +50,15 @@ METRICS = [
 ]
 
 
+DRAW = plot.plot_trajectory
+
+
+@pytest.fixture(autouse=True)
+def quick_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Most of the time of a run of the fake system is that of its picture."""
+    monkeypatch.setattr(plot, "plot_trajectory", lambda path, *_: path.write_text("quick"))
+
+
 @pytest.fixture
 def sequence(tmp_path: Path) -> Path:
     return make_sequence(tmp_path / "seq")
@@ -67,7 +77,10 @@ def fake_run(sequence: Path, out: Path, **options: object) -> RunSummary:
     return run(RunOptions(sequence, out=out, quiet=True, **options), FakeSystem)
 
 
-def test_a_run_writes_all_documented_files(sequence: Path, out: Path) -> None:
+def test_a_run_writes_all_documented_files(
+    sequence: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plot, "plot_trajectory", DRAW)
     config = SystemConfig(tracking=TrackingConfig(min_inliers=41))
     summary = fake_run(sequence, out, config=config)
     assert sorted(p.name for p in out.iterdir()) == sorted(FILES)  # and nothing temporary
@@ -128,7 +141,10 @@ def test_metrics_are_complete_and_correct(sequence: Path, out: Path) -> None:
     assert 20 < found["peak_rss_mb"] < 10_000
 
 
-def test_without_reference_there_are_no_errors(tmp_path: Path, out: Path) -> None:
+def test_without_reference_there_are_no_errors(
+    tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plot, "plot_trajectory", DRAW)
     summary = fake_run(make_sequence(tmp_path / "seq", truth=False), out)
     assert [n for n in values(summary) if n.startswith(("ate", "rpe"))] == []
     assert values(summary)["tracked_share"] == pytest.approx(0.9)

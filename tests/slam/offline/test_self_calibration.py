@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,10 +23,13 @@ from bmask_slam.calibration.adoption import (
     SelfCalibrationConfig,
     camera_with,
     format_found,
+    judged,
 )
+from bmask_slam.calibration.camera_check import CameraCheck
 from bmask_slam.calibration.priors import estimated_priors
 from bmask_slam.calibration.report import parameters_named
 from bmask_slam.config.configuration import resolve
+from bmask_slam.evaluation import plot
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.calibration.cross_validation import CrossValidation
 from bmask_slam.graph.calibration.model import BEND, LENS, PARAMETERS, SHUTTER, TIME
@@ -44,9 +50,25 @@ from bmask_slam.system_config import SystemConfig
 CONFIG = resolve(
     SystemConfig, None, ("semantics.segmenter.name=none", "features.max_keypoints=400")
 )
-FRAMES = 100
+FRAMES = 90
+"""The fewest that are looked at."""
 KILLED = (5, 7)
 """Before the checkpoint of 80 frames, and before that of the new beginning."""
+
+
+@contextmanager
+def short_ends() -> Iterator[None]:
+    """Ends runs without the picture and the check of the camera, which are tested elsewhere."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(frame_loop, "_camera_checked", lambda _: CameraCheck((), (), ()))
+        patch.setattr(plot, "plot_trajectory", lambda path, *_: path.write_text("quick"))
+        yield
+
+
+@pytest.fixture
+def quick() -> Iterator[None]:
+    with short_ends():
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +90,7 @@ def found(late_sweep: Path, tmp_path_factory: pytest.TempPathFactory) -> RunSumm
             if number in KILLED:
                 shutil.copytree(out, out.with_name(f"killed-{number}"))
 
-    with pytest.MonkeyPatch.context() as patch:
+    with short_ends(), pytest.MonkeyPatch.context() as patch:
         patch.setattr("bmask_slam.offline.checkpoint.write_checkpoint", copied)
         return run(late_options(late_sweep, out))
 
@@ -78,7 +100,7 @@ def late_options(sequence: Path, out: Path) -> RunOptions:
 
 
 def test_a_delay_is_found_and_adopted(
-    found: RunSummary, late_sweep: Path, sweep_camera: Camera, tmp_path: Path
+    found: RunSummary, late_sweep: Path, sweep_camera: Camera, quick: None, tmp_path: Path
 ) -> None:
     assert found.calibration.startswith("colour-depth delay")
     assert found.calibration.endswith("found and applied")
@@ -107,7 +129,9 @@ def test_the_map_of_such_a_run_is_continued_with_its_camera(
 
 
 @pytest.mark.parametrize("number", KILLED)
-def test_killed_before_and_after_the_adoption_and_resumed(number: int, found: RunSummary) -> None:
+def test_killed_before_and_after_the_adoption_and_resumed(
+    number: int, found: RunSummary, quick: None
+) -> None:
     killed = found.folder.with_name(f"killed-{number}")
     resumed = resume(killed, {"quiet": True})
     assert resumed is not None and resumed.calibration == found.calibration
@@ -115,7 +139,7 @@ def test_killed_before_and_after_the_adoption_and_resumed(number: int, found: Ru
         assert (killed / name).read_bytes() == (found.folder / name).read_bytes(), name
 
 
-def test_report_and_off_change_nothing(late_sweep: Path, tmp_path: Path) -> None:
+def test_report_and_off_change_nothing(late_sweep: Path, quick: None, tmp_path: Path) -> None:
     options = RunOptions(late_sweep, CONFIG, quiet=True, max_frames=FRAMES)
     reported = run(dataclasses.replace(options, out=tmp_path / "r", calibrate="report"))
     off = run(dataclasses.replace(options, out=tmp_path / "o", calibrate="off"))
@@ -193,6 +217,16 @@ def test_a_bend_of_depth_is_compared_over_the_image(
     sides = CrossValidation(calibrations, np.full((2, 18), 0.0005), np.zeros(4))
     assert estimate.agrees(xx, sides, config) is agrees
     assert "depth bent by up to 15 ± 2 mm at 1 m: said" in format_found(estimate, FREE, "said")
+
+
+def test_what_is_found_can_be_kept_in_a_checkpoint() -> None:
+    """Of three parameters that are looked for, two show."""
+    sigmas = np.where(np.isin(np.arange(18), FREE), 0.0005, 0.0)
+    sigmas[SHUTTER] = 0.1
+    estimate = Estimate(np.zeros(18), np.zeros(18), sigmas, None)  # type: ignore[arg-type]
+    camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+    state = judged(SelfCalibration(camera, camera), estimate, "auto", SelfCalibrationConfig())
+    assert json.dumps([state.settled, state.looks, state.text]).startswith("[false, 1, ")
 
 
 def test_an_unsure_bend_is_not_observable() -> None:

@@ -26,6 +26,7 @@ MOUNTING = (0.05, -0.1, 0.02, 0.5, -0.5, 0.5, -0.5)
 SETTINGS = [
     *("keyframes.min_interval_frames=1", "keyframes.max_shared=2.0", "keyframes.late_shared=2.0"),
     *(f"sensors.imu.imu_in_camera={list(MOUNTING)}", "mapping.redundant_share=2.0"),
+    "features.max_keypoints=300",
 ]
 CONFIG = resolve(SystemConfig, None, SETTINGS)
 R_UPRIGHT_WORLD = so3_exp(np.array([-1.5, 0.2, 0.4]))

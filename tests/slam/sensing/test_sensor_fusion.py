@@ -26,7 +26,7 @@ SETTINGS = [
     *("keyframes.min_interval_frames=1", "keyframes.max_shared=2.0", "keyframes.late_shared=2.0"),
     *(f"sensors.odometry.camera_in_base={list(MOUNTING)}", "mapping.redundant_share=2.0"),
     *(f"sensors.position.antenna_in_camera={list(LEVER)}", "sensors.position.sigma_m=0.01"),
-    "sensors.accelerometer.enabled=true",
+    *("sensors.accelerometer.enabled=true", "features.max_keypoints=300"),
 ]
 CONFIG = resolve(SystemConfig, None, SETTINGS)
 T_ENU_PLANE = make_pose(so3_exp(np.array([-1.5, 0.2, 0.4])), np.array([30.0, 20.0, 1.0]))

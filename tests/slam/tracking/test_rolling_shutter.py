@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 from synthetic_view import CAMERA, make_features, points_before, random_descriptors, render_plane
 
-from bmask_slam.features.brisk import Features
+from bmask_slam.features.brisk import FeatureConfig, Features
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.metrics import align
 from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.pose_optimisation import optimise_pose
 from bmask_slam.tracking.rolling_shutter import (
     Motion,
@@ -130,8 +131,9 @@ def test_the_path_of_a_shaken_camera_is_better() -> None:
     rows_s = 0.025 * share_of_rows(np.arange(480.0), CAMERA)
     frames = [render_plane(path(t + rows_s), i) for i, t in enumerate(times_s)]
     ate_m = {}
+    config = SystemConfig(FeatureConfig(max_keypoints=400))
     for readout_s in (-0.025, 0.0, 0.025):
-        system = SlamSystem(replace(CAMERA, rolling_shutter_s=readout_s))
+        system = SlamSystem(replace(CAMERA, rolling_shutter_s=readout_s), config)
         found = [system.process(frame).T_world_camera for frame in frames]
         assert all(T is not None for T in found)
         positions, truth = (np.array(T)[:, :3, 3] for T in (found, path(times_s)))
