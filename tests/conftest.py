@@ -81,10 +81,10 @@ SLOW_OFFICE_FRAMES = 60
 
 @pytest.fixture(scope="session")
 def slow_office(rendered: Callable[[RenderConfig], Path]) -> Path:
-    """Seven and a half seconds of the office at 8 Hz, in images of half the width and height."""
+    """Seven and a half seconds of the office at 8 Hz, in small images."""
     from bmask_slam.rendering.sequence import RenderConfig
 
-    return rendered(RenderConfig("office", SLOW_OFFICE_FRAMES, fps=8.0, width=320, height=240))
+    return rendered(RenderConfig("office", SLOW_OFFICE_FRAMES, fps=8.0, width=160, height=120))
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from repository import ROOT
-from source_tree import SOURCES
+from source_tree import SOURCES, nodes
 
 import bmask_slam
 from bmask_slam.config.configuration import _paths, dump
@@ -67,8 +67,7 @@ def test_the_messages_of_the_catalogue_are_in_the_code() -> None:
 
 
 def _texts(path: Path) -> str:
-    nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-    constants = (node.value for node in nodes if isinstance(node, ast.Constant))
+    constants = (node.value for node in nodes(path) if isinstance(node, ast.Constant))
     return "\n".join(value for value in constants if isinstance(value, str))
 
 

@@ -19,6 +19,7 @@ from source_tree import (
     imported_modules,
     imported_names,
     location,
+    nodes,
     parse,
     users_of_modules,
 )
@@ -77,7 +78,7 @@ def _within(folder: str, paths: set[str]) -> set[str]:
 
 
 def _functions(path: Path) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
-    for node in ast.walk(parse(path)):
+    for node in nodes(path):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
             yield f"{location(path)} {node.name}", node
 
@@ -268,7 +269,7 @@ def test_seams_are_small_modules_with_one_user() -> None:
 def test_only_the_command_line_prints() -> None:
     found = set()
     for path in SOURCES:
-        for node in ast.walk(parse(path)):
+        for node in nodes(path):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "print":
                 found.add(location(path))
     assert {path for path in found if not path.startswith("slam/commands/")} <= {"slam/cli.py"}

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 from repository import ROOT
+from source_tree import SOURCES, imported_names
 
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PROJECT = PYPROJECT["project"]
@@ -261,8 +262,6 @@ def test_every_requirement_is_a_range_that_its_constraint_is_in() -> None:
 
 
 def test_every_import_is_a_declared_dependency() -> None:
-    import ast
-
     distributions = {
         "cv2": "opencv-python-headless",
         "yaml": "pyyaml",
@@ -278,13 +277,7 @@ def test_every_import_is_a_declared_dependency() -> None:
         {_canonical(re.split(r"[><=]", text)[0]) for text in texts}
         for texts in (PROJECT["dependencies"], _libraries_of_extras())
     )
-    needed = set()
-    for path in (p for k in FOLDERS.values() for p in (ROOT / k).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Import):
-                needed |= {alias.name.partition(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom):
-                needed.add(str(node.module).partition(".")[0])
+    needed = {name.partition(".")[0] for path in SOURCES for name, _ in imported_names(path)}
     needed -= {*sys.stdlib_module_names, *FOLDERS}
     assert {_canonical(distributions.get(name, name)) for name in needed} - extras == declared
 

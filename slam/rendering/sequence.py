@@ -17,6 +17,7 @@ from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.geometry import inverse
+from bmask_slam.mapping.open3d_loader import load_open3d
 from bmask_slam.rendering.annotations import (
     OBJECTS_TRUTH,
     VisibleInstance,
@@ -119,6 +120,7 @@ def render_sequence(
     """
     _check(config)
     with new_folder(Path(out)) as folder:
+        load_open3d()  # if it is not there, that is said before a room is built
         job = _prepare(config, folder)
         visible: list[list[VisibleInstance]] = []
         for found in _draw_all(job):
@@ -209,10 +211,9 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
     poses = poses[: config.frames]
     delay_s = config.depth_delay_ms / 1e3
     late = camera_poses(plan.path, config.fps, config.seed, delay_s, config.sweeping)
-    depth_poses = late[: config.frames]
     detail = float(np.clip(config.width / 640, 0.25, 1.0))
     alike = RenderConfig(config.name, None, config.seed, config.people, config.carry)
-    hung = tuple(sensor for sensor in config.sensors if sensor == MARKERS)
+    hung = (MARKERS,) if MARKERS in config.sensors else ()
     alike = replace(alike, rounds=config.rounds, sensors=hung)
     boxes, cast, scene, markers = _built(alike, detail)
     if markers:
@@ -220,8 +221,8 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
     write_json(folder / OBJECTS_TRUTH, boxes)
     camera = kinect_camera(config)
     stamps = [f"{i / config.fps:.6f}" for i in range(len(poses))]
-    renderer = Renderer(camera, scene.atlas, scene.static)
-    return _Job(config, folder, camera, poses, depth_poses, stamps, scene, cast, renderer)
+    shown = Renderer(camera, scene.atlas, scene.static)
+    return _Job(config, folder, camera, poses, late[: config.frames], stamps, scene, cast, shown)
 
 
 @lru_cache(maxsize=4)
@@ -274,8 +275,7 @@ def _draw(job: _Job, i: int) -> list[VisibleInstance]:
     write_png(job.folder / "depth" / name, stored_depth(depth_m, job.camera.depth_scale))
     write_png(job.folder / "instances" / name, view.instances)
     if job.config.true_depth:
-        stored = stored_depth(true_m, job.camera.depth_scale)
-        write_png(job.folder / "depth_true" / name, stored)
+        write_png(job.folder / "depth_true" / name, stored_depth(true_m, job.camera.depth_scale))
     if job.config.normals:
         write_png(job.folder / "normals" / name, to_image(127.5 * view.normals + 127.5))
     return visible_instances(view.instances)

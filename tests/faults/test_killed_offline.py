@@ -20,7 +20,7 @@ from repository import KITCHEN
 from bmask_slam.offline.runner import RunOptions, resume, run
 from bmask_slam.run_folder.folder import CHECKPOINT
 
-FRAMES, EVERY = 24, 6
+FRAMES, EVERY = 16, 4
 SEEDS = range(int(os.environ.get("BMASK_SLAM_FAULT_SEEDS", "1")))
 TIMED = ("log.txt", "metrics.json", "trajectory.png")  # hold dates or times
 OPTIONS = RunOptions(KITCHEN, max_frames=FRAMES, checkpoint_every=EVERY, quiet=True)

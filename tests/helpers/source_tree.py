@@ -36,13 +36,19 @@ def parse(path: Path) -> ast.Module:
 
 
 @cache
+def nodes(path: Path) -> tuple[ast.AST, ...]:
+    """All nodes of a file's syntax tree."""
+    return tuple(ast.walk(parse(path)))
+
+
+@cache
 def imported_names(path: Path) -> tuple[tuple[str, str], ...]:
     """Every import as (module, name), name empty for a plain ``import module``.
 
     Imports inside functions and under ``if TYPE_CHECKING`` count; relative ones have a dot ahead.
     """
     found: list[tuple[str, str]] = []
-    for node in ast.walk(parse(path)):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             found += [(alias.name, "") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -17,6 +18,8 @@ from bmask_slam.sequences.frame import Frame
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 CAMERA = Camera(640, 480, fx=525.0, fy=520.0, cx=318.5, cy=241.5)
+HALF_CAMERA = Camera(320, 240, fx=262.5, fy=260.0, cx=159.25, cy=120.75, stereo_bf_px_m=15.0)
+"""Sees every other pixel of every other row of ``CAMERA``."""
 T_NEW_OLD = se3_exp(np.array([0.4, -1.1, 0.7, 3.0, -5.0, 2.0]))
 PLANE_Z_M = 2.0
 _TEXELS_PER_M = 250.0
@@ -57,6 +60,13 @@ def render_plane(T_world_camera: Array, index: int = 0) -> Frame:
     image = cv2.remap(plane_texture(), u, v, cv2.INTER_LINEAR)
     rgb = cv2.cvtColor(np.rint(image).astype(np.uint8), cv2.COLOR_GRAY2RGB)
     return Frame(index, index / 30.0, rgb, z_m.astype(np.float32))
+
+
+def render_half(T_world_camera: Array, index: int = 0) -> Frame:
+    """`render_plane` by ``HALF_CAMERA``: a quarter of the pixels."""
+    frame = render_plane(T_world_camera, index)
+    half = np.s_[::2, ::2]
+    return replace(frame, rgb=frame.rgb[half].copy(), depth_m=frame.depth_m[half].copy())
 
 
 def render_or_black(T_world_camera: Array | None, index: int) -> Frame:

@@ -24,6 +24,7 @@ def write_report(comparison: Comparison, folder: Path) -> list[Path]:
     Returns the paths. The figure of a cell with missing or broken files is skipped, with a
     warning. The same comparison and files give the same bytes.
     """
+    refuse_link(folder / FIGURES)  # before anything is drawn
     sections, sentences = make_sections(comparison, folder), summary(comparison)
     ablation = ablation_table(comparison)
     tables = [*metric_tables(comparison), *([ablation] if ablation else [])]
@@ -43,7 +44,6 @@ def write_report(comparison: Comparison, folder: Path) -> list[Path]:
 
 def _write_figures(folder: Path, sections: list[Section]) -> list[Path]:
     """Write every drawing as a PDF for a paper, and remove earlier ones."""
-    refuse_link(folder)
     folder.mkdir(exist_ok=True)
     drawn = [p for section in sections for p in section.pictures if p.pdf is not None]
     files = {}

@@ -20,7 +20,6 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.network.carrying import CarriedFiles, Outbox
 from bmask_slam.live.network.connection import CODE_BYTES, Connection, Keys, admit
-from bmask_slam.live.processes.map_process import serve_map
 from bmask_slam.live.processes.segmentation import serve_segmenter
 from bmask_slam.live.processes.worker import ONE_THREAD, run_first, safe_import_path
 
@@ -163,6 +162,8 @@ def work(descriptor: int) -> None:
 def _run(channel: Channel, folder: Path, name: str, arguments: tuple[Any, ...], state: Any) -> None:
     """Do a worker's work until its owner ends."""
     if name == "map":
+        from bmask_slam.live.processes.map_process import serve_map  # noqa: PLC0415 - takes 1 s
+
         path = None
         if state is not None:
             path = folder / "state"

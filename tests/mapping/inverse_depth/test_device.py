@@ -110,7 +110,7 @@ def keyframes(count: int) -> list[DenseKeyframe]:
 
 def fused(source: DepthSource, device: str) -> list[FusedKeyframe]:
     mapper = DenseMapper(CAMERA, DenseConfig(source=source, device=device))
-    return [r for k in keyframes(5) for r in mapper.add(k)] + mapper.flush()
+    return [r for k in keyframes(3) for r in mapper.add(k)] + mapper.flush()
 
 
 @pytest.mark.parametrize("source", get_args(DepthSource))

@@ -15,6 +15,7 @@ from bmask_slam.graph.data_files import data_path
 from bmask_slam.semantics.labels import label_set, read_label_set
 from bmask_slam.semantics.network.config import LIGHT
 from bmask_slam.semantics.network.model import MaskRCNN
+from bmask_slam.semantics.training import run
 from bmask_slam.semantics.training.run import transferred
 from bmask_slam.semantics.weights.checkpoints import TrainedNetwork, load_network
 from bmask_slam.semantics.weights.light_weights import SHIPPED, load_light
@@ -37,7 +38,7 @@ def test_new_heads_of_the_light_network_are_trained(
 ) -> None:
     images = str(SHARED / "coco_excerpt" / "images")
     command = ["train", "--data", str(few), "--images", images, "--quiet"]
-    command += ["--steps", "2", "--batch", "1", "--out", str(tmp_path / "out")]
+    command += ["--steps", "1", "--batch", "1", "--out", str(tmp_path / "out")]
     assert main(command) == 0
     weights = Path(capsys.readouterr().out.strip())
     new, shipped = (load_light(path).model.state_dict() for path in (weights, data_path(*SHIPPED)))
@@ -47,13 +48,18 @@ def test_new_heads_of_the_light_network_are_trained(
 
 
 def test_a_network_on_mobilenet_is_trained_and_resumed(
-    few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    few: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    small = replace(LIGHT, image=replace(LIGHT.image, short_px=120, long_px=200))
+    monkeypatch.setattr(run, "LIGHT", small)
     images = str(SHARED / "coco_excerpt" / "images")
     command = ["train", "--data", str(few), "--images", images, "--labels", "paper", "--quiet"]
     command += [
         "--steps",
-        "2",
+        "1",
         "--batch",
         "1",
         "--rois",

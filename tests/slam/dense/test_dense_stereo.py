@@ -23,11 +23,10 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.yaml_file import format_yaml, read_yaml
 from bmask_slam.graph.geometry import make_pose
-from bmask_slam.rendering.engine.builder import SceneBuilder
 from bmask_slam.rendering.engine.path import camera_poses
 from bmask_slam.rendering.engine.raycast import Renderer, to_image
-from bmask_slam.rendering.engine.scene import build_scene
 from bmask_slam.rendering.rooms import office
+from bmask_slam.rendering.sequence import RenderConfig, _built
 from bmask_slam.rendering.writer import stored_depth, write_lists, write_png
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.labels import label_set
@@ -45,9 +44,7 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sequence with right images, their stamps 5 ms late, and the true depth in depth_true/."""
     folder = tmp_path_factory.mktemp("stereo") / "office"
     folder.mkdir()
-    builder = SceneBuilder(0, detail=0.4)
-    office.furnish(builder)
-    scene = build_scene(builder, office.LIGHTING, [], 0)
+    scene = _built(RenderConfig("office"), 0.25)[2]  # other tests of this process have it too
     renderer = Renderer(CAMERA, scene.atlas, scene.static)
     poses: Array = camera_poses(office.PATH, 30.0, 0)[: 6 * COUNT : 6]
     aside = make_pose(np.eye(3), np.array([CAMERA.stereo_bf_px_m / CAMERA.fx, 0, 0]))

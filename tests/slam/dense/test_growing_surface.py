@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import fill
-from synthetic_view import CAMERA, PLANE_Z_M, render_plane
+from synthetic_view import HALF_CAMERA as CAMERA
+from synthetic_view import PLANE_Z_M, render_half
 
 from bmask_slam.config.configuration import dump
 from bmask_slam.dense.growing import frames as frames_module
@@ -46,13 +47,13 @@ from bmask_slam.world.world_map import Keyframe, WorldMap
 
 KEYFRAMES = 4
 POSES = {k: se3_exp(np.array([0, 0.01 * k, 0, 0.06 * k, 0, 0])) for k in range(KEYFRAMES)}
-FRAMES = {k: render_plane(T, 10 * k) for k, T in POSES.items()}
+FRAMES = {k: render_half(T, 10 * k) for k, T in POSES.items()}
 BETWEEN = se3_exp(np.array([0, 0.015, 0, 0.09, 0, 0]))
 """Between keyframes 1 and 2."""
-IMAGES = render_plane(BETWEEN, 15)
+IMAGES = render_half(BETWEEN, 15)
 SEEN_BY_ALL = 0.165, 0.0, PLANE_Z_M
 """In the masks of all keyframes."""
-IDS, PIXELS = np.arange(4), np.array([[100.0, 100.0], [110.0, 120.0], [320.0, 240.0], [500, 300]])
+IDS, PIXELS = np.arange(4), np.array([[50.0, 50.0], [55.0, 60.0], [160.0, 120.0], [250, 150]])
 STEP = GrowingSurface.step
 LABELS = ("background", "person")
 
@@ -157,8 +158,8 @@ def test_late_masks_are_cut_out_of_the_surface(tmp_path) -> None:
     server = with_keyframes(make_server(tmp_path / "run"))
     server.handle(between())
     before = worked(server)
-    mask = np.zeros((480, 640), bool)
-    mask[200:280, 280:380] = True
+    mask = np.zeros((240, 320), bool)
+    mask[100:140, 140:190] = True
     person = Instance(mask, mask_box(mask), 1, certain(1, 2), 1.0, 1.0)
     for k in POSES:
         server.handle(LateMasks(k, [person], IDS, PIXELS))
@@ -219,7 +220,7 @@ def test_a_broken_keyframe_does_not_take_the_frames_around_it_along(tmp_path, ca
 
 def test_frames_are_stored_without_loss_of_depth(tmp_path) -> None:
     rng = np.random.default_rng(0)
-    raw = rng.integers(0, 65536, (480, 640))
+    raw = rng.integers(0, 65536, (240, 320))
     depth_m = np.where(raw > 0, raw / np.float32(5000), np.float32(np.nan)).astype(np.float32)
     store = FrameStore(tmp_path, CAMERA, 1 << 24)
     store.add(replace(between(), frame=replace(IMAGES, depth_m=depth_m)))
@@ -239,7 +240,7 @@ def test_a_bounded_store_and_a_full_disk_refuse_frames_and_say_so(small_disk, ca
     assert (store.unwritten, store.places) == (1, {})
     ballast.unlink()
     assert store.add(between())
-    assert store.load(15).depth_m.shape == (480, 640)
+    assert store.load(15).depth_m.shape == (240, 320)
 
 
 def refuse_frames(surface: GrowingSurface, ended: bool = False) -> bool:

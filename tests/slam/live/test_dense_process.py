@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from synthetic_view import CAMERA, PLANE_Z_M, render_plane
+from synthetic_view import HALF_CAMERA as CAMERA
+from synthetic_view import PLANE_Z_M, render_half
 
 from bmask_slam.config.configuration import dump
 from bmask_slam.dense.folder import DenseFolder
@@ -31,18 +32,18 @@ from bmask_slam.system_config import SystemConfig
 
 LABELS = ("background", "person", "chair")
 POSES = {k: se3_exp(np.array([0, 0.01 * k, 0, 0.03 * k, 0, 0])) for k in range(8)}
-FRAMES = {k: render_plane(T, k) for k, T in POSES.items()}
-PIXELS = np.array([[100.0, 100.0], [110.0, 120.0], [320.0, 240.0], [500.0, 300.0]])
+FRAMES = {k: render_half(T, k) for k, T in POSES.items()}
+PIXELS = np.array([[50.0, 50.0], [55.0, 60.0], [160.0, 120.0], [250.0, 150.0]])
 
 
 def instance(label: int, rows: slice, columns: slice) -> Instance:
-    mask = np.zeros((480, 640), bool)
+    mask = np.zeros((240, 320), bool)
     mask[rows, columns] = True
     return Instance(mask, mask_box(mask), label, certain(label, len(LABELS)), 1.0, 1.0)
 
 
-CHAIR = instance(2, slice(80, 180), slice(80, 200))
-PERSON = instance(1, slice(250, 400), slice(400, 560))
+CHAIR = instance(2, slice(40, 90), slice(40, 100))
+PERSON = instance(1, slice(125, 200), slice(200, 280))
 
 
 def snapshot(number: int, T: Array | None = None) -> KeyframeSnapshot:

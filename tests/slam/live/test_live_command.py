@@ -1,4 +1,4 @@
-"""``bmask-slam live`` as a process: its files after every kind of end."""
+"""``bmask-slam live``: its files after every kind of end, those by a signal as a process."""
 
 from __future__ import annotations
 
@@ -43,12 +43,10 @@ def frames_written(out: Path) -> int:
     return len(path.read_text().splitlines()) - 1 if path.is_file() else 0
 
 
-def test_masks_from_another_process_label_the_map(slow_office, tmp_path) -> None:
-    live = start(slow_office, tmp_path / "run", "--segmenter", "truth", *SHORT)
-    output, errors = live.communicate(timeout=300)
-    assert live.returncode == 0, errors
-    assert "latency_ms_median" in output
+def test_masks_from_another_process_label_the_map(slow_office, tmp_path, capsys) -> None:
     out = tmp_path / "run"
+    assert main(["live", str(slow_office), "--out", str(out), "--segmenter", "truth", *SHORT]) == 0
+    assert "latency_ms_median" in capsys.readouterr().out
     health = json.loads((out / "health.json").read_text())
     assert health["frames"] == FRAMES == len(read_tum(out / "trajectory.txt"))
     assert health["segmenter_deaths"] == health["map_deaths"] == 0
@@ -61,10 +59,9 @@ def test_a_live_dense_map_equals_the_offline_one_and_can_be_continued(
 ) -> None:
     """After a dropped frame, keyframe numbers differ from image numbers."""
     out, offline, some = tmp_path / "live", tmp_path / "offline", ("--max-frames", "16")
-    live = start(slow_office, out, "--realtime", "--map", *COARSE, *UNCALIBRATED, *some)
-    output, errors = live.communicate(timeout=300)
-    assert live.returncode == 0, errors
-    assert "Dense map" in output
+    words = ["live", str(slow_office), "--out", str(out), "--realtime", "--map"]
+    assert main([*words, *COARSE, *UNCALIBRATED, *some]) == 0
+    assert "Dense map" in capsys.readouterr().out
     common = [str(slow_office), "--segmenter", "none", "--out", str(offline), "--quiet", *some]
     assert main(["run", *common]) == 0
     assert main(["map", str(offline), *COARSE, "--quiet"]) == 0

@@ -273,7 +273,7 @@ def test_a_process_without_its_keys_reads_nothing() -> None:
 def test_connections_that_have_ended_keep_no_descriptor(cut) -> None:
     there = workstation(cut)
     before = len(os.listdir("/proc/self/fd"))
-    for _ in range(3):
+    for _ in range(2):
         end = there.worker("nothing", ())
         until(lambda end=end: not end.is_running)
         assert end.receive()

@@ -28,7 +28,7 @@ from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
 
-FRAMES = 30
+FRAMES, EVERY = 20, 6
 SAME = ("trajectory.txt", "keyframes.txt", "landmarks.ply", "events.csv", "map", "labels.csv")
 
 
@@ -61,7 +61,7 @@ def with_each_frame(
 def whole(slow_office: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with true masks and checkpoints."""
     out = tmp_path_factory.mktemp("parallel") / "run"
-    return run(options(slow_office, out, "truth", checkpoint_every=10)).folder
+    return run(options(slow_office, out, "truth", checkpoint_every=EVERY)).folder
 
 
 def test_it_tracks_as_well_as_one_process_does(slow_office: Path, whole: Path, tmp_path) -> None:
@@ -80,7 +80,7 @@ def test_it_repeats_its_bytes_however_fast_the_others_are(
 ) -> None:
     """Here answers wait for tracking, in the other run tracking waits for them."""
     with_each_frame(monkeypatch, lambda system, index: time.sleep(0.1 * (index % 3)))
-    again = run(options(slow_office, tmp_path / "run", "truth", checkpoint_every=10))
+    again = run(options(slow_office, tmp_path / "run", "truth", checkpoint_every=EVERY))
     assert result(again.folder) == result(whole)
     assert not children()
 
@@ -89,15 +89,15 @@ def test_killed_and_resumed_it_ends_in_the_same_bytes(
     slow_office: Path, whole: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "run"
-    words = ["--segmenter", "truth", "--parallel", "--checkpoint-every", "10", "--quiet"]
+    words = ["--segmenter", "truth", "--parallel", "--checkpoint-every", str(EVERY), "--quiet"]
     command = [sys.executable, "-m", "bmask_slam", "run", str(slow_office), "--out", str(out)]
     process = subprocess.Popen([*command, *words, "--max-frames", str(FRAMES)])
 
-    def has_written_25_frames() -> bool:
+    def has_written_15_frames() -> bool:
         frames = out / "frames.csv"
-        return frames.is_file() and len(frames.read_text().splitlines()) > 25
+        return frames.is_file() and len(frames.read_text().splitlines()) > 15
 
-    wait_until(has_written_25_frames)
+    wait_until(has_written_15_frames)
     process.kill()
     process.wait()
     assert resume(out) is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -17,17 +18,21 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.offline import runner
 from bmask_slam.offline.options import RunOptions
+from bmask_slam.rendering.sequence import RenderConfig
 from bmask_slam.run_folder.covariance_file import COVARIANCES, read_covariances
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.run_folder.semantic_files import read_labels
 
 
 @pytest.fixture(scope="module")
-def labelled(slow_office: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def labelled(
+    rendered: Callable[[RenderConfig], Path], tmp_path_factory: pytest.TempPathFactory
+) -> Run:
     """A short run with exact masks, covariances and a dense map."""
+    office = rendered(RenderConfig("office", 16, fps=8.0, width=320, height=240))
     folder = tmp_path_factory.mktemp("reader")
     settings = {"covariances": True, "semantics.segmenter.min_score": 0.5}
-    found = run(slow_office, folder / "run", segmenter="truth", settings=settings, max_frames=16)
+    found = run(office, folder / "run", segmenter="truth", settings=settings)
     return map_run(found, voxel_m=0.02)
 
 
