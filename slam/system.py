@@ -11,6 +11,7 @@ import numpy as np
 from bmask_slam.back_end.map_backend import MapBackend
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.back_end.marker_loops import join_by_markers
+from bmask_slam.back_end.segment_joining import can_join
 from bmask_slam.features.brisk import BriskExtractor, Features
 from bmask_slam.features.marker_detection import MarkerDetector
 from bmask_slam.graph.arrays import Array, Arrays, Ints
@@ -268,9 +269,9 @@ class SlamSystem(SensorSystem):
         others = [k for k in world.keyframes.values() if k.segment != tracker.segment]
         if not others or not world.in_segment(tracker.segment):
             return tracked
-        recognised = tracker.recognise(tracked.features, others)
-        if recognised is not None:
-            joined = self.mapper.join(tracker.segment, tracked, recognised)
+        rules, found = self.config.relocalisation, tracker.recognise(tracked.features, others)
+        if found is not None and can_join(world, tracker.segment, tracked, found, rules):
+            joined = self.mapper.join(tracker.segment, tracked, found)
         elif (T := join_by_markers(self.mapper, tracker.segment)) is not None:
             joined = replace(tracked, T_world_camera=T @ tracked.T_world_camera)
         else:

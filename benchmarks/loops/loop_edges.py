@@ -119,12 +119,12 @@ class Observed(SlamSystem):
         self.drifted: set[tuple[int, int]] = set()
         closer, within = self.mapper.loops, self.mapper.loops._within_drift
 
-        def spy(loop: LoopConstraint, world: Any) -> bool:
-            fits = within(loop, world)
+        def spy(loop: LoopConstraint, *given: Any) -> bool:
+            fits = within(loop, *given)
             self.drifted |= set() if fits else {loop.ends}
             return fits
 
-        closer._within_drift = spy  # type: ignore[method-assign]
+        closer._within_drift = spy  # type: ignore[method-assign, assignment]
 
     def verify(self, a: LoopView, b: LoopView, camera: Any, config: Any) -> LoopConstraint | NoLoop:
         result = verify_loop(a, b, camera, config)

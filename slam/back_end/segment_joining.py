@@ -12,7 +12,9 @@ from bmask_slam.graph.factors.graph_update import ANCHOR, RelativePose
 from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.geometry import inverse, transform
+from bmask_slam.tracking.relocalisation import RelocalisationConfig
 from bmask_slam.tracking.results import Tracked
+from bmask_slam.world.covisibility import CovisiblePaths
 from bmask_slam.world.world_map import WorldMap
 
 
@@ -37,6 +39,33 @@ def join_segment(world: WorldMap, segment: int, tracked: Tracked, recognised: Tr
         keypoints=np.concatenate([recognised.keypoints, tracked.keypoints[only]]),
         landmark_ids=np.concatenate([recognised.landmark_ids, tracked.landmark_ids[only]]),
     )
+
+
+def can_join(
+    world: WorldMap,
+    segment: int,
+    tracked: Tracked,
+    recognised: Tracked,
+    config: RelocalisationConfig,
+) -> bool:
+    """Whether a camera can have moved as ``join_segment`` would say, between the two segments.
+
+    Of several rooms that look alike each is recognised as easily as the one that the camera is in;
+    but between the last keyframe before a segment and its first it moved as ``config`` allows for
+    a camera that is lost, with the drift of both segments.
+    """
+    T_other_segment = recognised.T_world_camera @ inverse(tracked.T_world_camera)
+    _, nearest = world.covisible(recognised.landmark_ids, 1)[0]
+    own = world.in_segment(segment)
+    before = [k for k in world.in_segment(nearest.segment) if k.id < own[0].id]
+    gap_s = own[0].timestamp_s - before[-1].timestamp_s if before else -1.0
+    if gap_s < 0:  # another recording
+        return True
+    moved = T_other_segment @ own[0].T_world_camera - before[-1].T_world_camera
+    paths = CovisiblePaths(world)
+    ways = paths.between(own[0].id, own[-1].id) + paths.between(before[-1].id, nearest.id)
+    limit_m = config.near_m + config.max_speed_m_s * gap_s + config.drift_m_per_m * ways[1]
+    return bool(np.linalg.norm(moved[:3, 3]) < limit_m)
 
 
 def move_segment(world: WorldMap, segment: int, T_other_segment: Array, target: int) -> None:

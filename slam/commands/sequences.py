@@ -30,7 +30,7 @@ def add_render(commands: Commands) -> None:
     text = "render an indoor sequence with exact ground truth, in TUM layout"
     parser = commands.add_parser("render", help=text, description=text)
     parser.set_defaults(handler=_render)
-    scenes = "office, busy_office, crowded_office, living_room, corridor or room"
+    scenes = "office, busy_office, crowded_office, living_room, corridor, building or room"
     parser.add_argument("name", help=scenes)
     parser.add_argument("--out", type=Path, required=True, help="folder to make")
     parser.add_argument("--frames", type=int, metavar="N", help="number of frames (default: all)")

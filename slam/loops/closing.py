@@ -23,6 +23,7 @@ from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.loops.noise import Cycles, LoopNoise, NoiseConfig
 from bmask_slam.loops.place_recognition import PlaceConfig, PlaceRecogniser
 from bmask_slam.loops.verification import LoopConfig, LoopConstraint, NoLoop, loop_view, verify_loop
+from bmask_slam.world.covisibility import CovisiblePaths
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 MEDIAN_CHI2_6DOF = 5.348
@@ -171,7 +172,8 @@ class LoopCloser:
 
         All members are returned: loops that waited, and those that confirm them.
         """
-        loops = [loop for loop in proposed if self._within_drift(loop, world)]
+        paths = CovisiblePaths(world)
+        loops = [loop for loop in proposed if self._within_drift(loop, world, paths)]
         if not loops:
             return []
         found, loops = loops, [*self.waiting, *loops][-self.config.waiting :]
@@ -233,12 +235,14 @@ class LoopCloser:
             and not inside.get(pair, False)
         }
 
-    def _within_drift(self, loop: LoopConstraint, world: WorldMap) -> bool:
-        """Whether the drift that a loop implies is possible."""
+    def _within_drift(self, loop: LoopConstraint, world: WorldMap, paths: CovisiblePaths) -> bool:
+        """Whether the drift that a loop implies is possible on the shortest way between its ends.
+
+        Rooms that look alike give loops that agree with each other; only the way between them, over
+        which the map cannot have drifted so far, tells them apart.
+        """
         a, b = (world.keyframes[k].T_world_camera for k in loop.ends)
-        ids, travelled = world.travelled()
-        path = np.subtract(*travelled[np.searchsorted(ids, loop.ends[::-1])])
-        S = self.noise.covariance(loop) + self.noise.map_covariances(path)
+        S = self.noise.covariance(loop) + self.noise.possible_drift(paths.between(*loop.ends))
         r = se3_log(inverse(loop.T_a_b) @ inverse(a) @ b)
         fits = bool(mahalanobis(r[None], S[None])[0] < self.config.gate)
         if not fits:

@@ -13,6 +13,8 @@ from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.world.world_map import WorldMap
 
 DIMENSIONS = 6
+ROOT_FROM_M = 4.0
+"""On longer ways the drift grows with the root of the length, as a sum of independent errors."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +139,19 @@ class LoopNoise:
         floor = np.array([rules.model_sigma_rad, rules.model_sigma_m])
         return _diagonal(floor + rules.model_share * change)
 
+    def possible_drift(self, way: Array) -> Array:
+        """Covariance (6, 6) of the map's relative pose over a way (3,), see ``CovisiblePaths``.
+
+        What ``map_covariances`` states for a short path. On a long way independent errors add up as
+        squares, and an error of rotation displaces the end as far as the way leads away.
+        """
+        rules, (turn_rad, length_m, away_m) = self.config, way
+        bent, drift_rad = rules.model_share * turn_rad, rules.drift_rad_per_m * _growth(length_m)
+        sigma_rad = np.hypot(rules.model_sigma_rad + bent, drift_rad)
+        drift_m = np.hypot(rules.drift_m_per_m * _growth(length_m), drift_rad / 2 * away_m)
+        sigma_m = np.hypot(rules.model_sigma_m + bent, drift_m)
+        return _diagonal(np.array([sigma_rad, sigma_m]))
+
     def map_covariances(self, paths: Array) -> Array:
         """Covariances (..., 6, 6) of the map's relative pose over paths (..., 2) in rad and metres.
 
@@ -147,6 +162,11 @@ class LoopNoise:
         sigmas_rad = rules.model_sigma_rad + drift_rad + bent
         sigmas_m = rules.model_sigma_m + (rules.drift_m_per_m + drift_rad / 2) * lengths_m + bent
         return _diagonal(np.stack([sigmas_rad, sigmas_m], axis=-1))
+
+
+def _growth(lengths_m: Array) -> Array:
+    """Metres (...) that count for the drift of ways of so many metres."""
+    return np.minimum(lengths_m, np.sqrt(ROOT_FROM_M * lengths_m))
 
 
 def _diagonal(sigmas: Array) -> Array:

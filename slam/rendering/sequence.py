@@ -231,8 +231,7 @@ def _built(
 ) -> tuple[dict[str, Any], Cast, Scene, list[PlacedMarker]]:
     """The true boxes, people, scene and markers; textures have ``detail`` of the full resolution.
 
-    The last are kept, since a scene is often rendered again at another rate or length. So
-    ``config`` may hold only what they depend on.
+    The last are kept, for other rates and lengths; ``config`` may hold only what they depend on.
     """
     plan = _plan(config)
     builder = SceneBuilder(config.seed, detail=detail)

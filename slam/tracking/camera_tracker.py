@@ -11,7 +11,7 @@ from bmask_slam.graph.geometry import inverse, orthonormalised
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.guided_landmarks import GuidedLandmarks
 from bmask_slam.tracking.motion_model import MotionModel
-from bmask_slam.tracking.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
+from bmask_slam.tracking.relocalisation import RelocalisationConfig, is_within_reach, relocalise
 from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, more, reckoned, untracked
 from bmask_slam.tracking.rolling_shutter import PreviousPose
 from bmask_slam.tracking.tracker import Tracker
@@ -19,8 +19,7 @@ from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
 from bmask_slam.world.map_editor import MapReader
 from bmask_slam.world.world_map import Keyframe
 
-MAX_AGO_S = 0.2
-"""The velocity for the rolling shutter is not taken from an older pose."""
+MAX_AGO_S = 0.2  # the velocity for the rolling shutter is not taken from an older pose
 
 
 class CameraTracker:
@@ -142,10 +141,9 @@ class CameraTracker:
 
     def exclude_landmarks(self, landmark_ids: Ints) -> None:
         """Do not track against these landmarks (N,)."""
-        if not len(landmark_ids):
-            return
-        self._local_ids = np.setdiff1d(self._local_ids, landmark_ids)
-        self._recent_ids = self._recent_ids[~np.isin(self._recent_ids, landmark_ids)]
+        if len(landmark_ids):
+            self._local_ids = np.setdiff1d(self._local_ids, landmark_ids)
+            self._recent_ids = self._recent_ids[~np.isin(self._recent_ids, landmark_ids)]
 
     def track(self, features: Features) -> Tracked:
         """The frame's pose, also in another segment; one that is long lost begins a segment.
@@ -194,18 +192,21 @@ class CameraTracker:
         world = self._map.world
         known = list(world.keyframes.values()) if everywhere else world.in_segment(self.segment)
         tracked = self.recognise(features, known)
-        if tracked is not None:
-            _, nearest = world.covisible(tracked.landmark_ids, 1)[0]
-            if nearest.segment != self.segment:
-                self.refer_to(nearest)
-                self.segment = nearest.segment
-        return tracked
+        if tracked is None:
+            return None
+        _, nearest = world.covisible(tracked.landmark_ids, 1)[0]
+        if nearest.segment != self.segment:
+            self.refer_to(nearest)
+            self.segment = nearest.segment
+            return tracked
+        way, rules = (nearest, self.reference), self._relocalisation
+        near = is_within_reach(self._motion, tracked.T_world_camera, world, way, rules)
+        return tracked if near else None
 
     def recognise(self, features: Features, keyframes: list[Keyframe]) -> Tracked | None:
         """The frame's pose against some keyframes, without a prior; None if it is not there."""
-        world, rules = self._map.world, self._relocalisation
-        candidates = similar_keyframes(features, keyframes, self._map.places, rules.min_votes)
-        return relocalise(features, candidates, world, self.tracker, rules, self._local_map)
+        rules = self._relocalisation, self._local_map
+        return relocalise(features, keyframes, self._map, self.tracker, *rules)
 
     def update_motion(
         self, T_world_tracked: Array, T_world_camera: Array, landmark_ids: Ints
@@ -266,9 +267,8 @@ class CameraTracker:
         tracked = self._tracked(features, self._local_ids)
         if tracked.firm < self._images.config.few_inliers:
             self._follow(features)
-        if self._images.followed is None:
-            return tracked
-        return more(tracked, self._guided(features), enough)
+        followed = self._images.followed is not None
+        return more(tracked, self._guided(features), enough) if followed else tracked
 
     def _guided(self, features: Features) -> Tracked:
         """The pose by the local map, of which landmarks were followed from the last image."""

@@ -12,9 +12,12 @@ from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.features.matching import MatchConfig, consistent_rotation, match_brute_force
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import make_pose
+from bmask_slam.tracking.motion_model import MotionModel
 from bmask_slam.tracking.results import Tracked, TrackingStatus
 from bmask_slam.tracking.tracker import Tracker
+from bmask_slam.world.covisibility import CovisiblePaths
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
+from bmask_slam.world.map_editor import MapReader
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 
@@ -22,8 +25,10 @@ from bmask_slam.world.world_map import Keyframe, WorldMap
 class RelocalisationConfig:
     """``candidates`` keyframes with the most votes, at least ``min_votes``, are tried.
 
-    A pose needs ``min_inliers``. After ``patience_frames`` lost frames a new map segment is begun,
-    if the frame has ``min_new_points`` with depth.
+    A pose needs ``min_inliers``, and must be within reach of the last one: ``near_m``, what
+    ``max_speed_m_s`` allows, and ``drift_m_per_m`` of the way through the map between the two.
+    After ``patience_frames`` lost frames a new map segment is begun, if the frame has
+    ``min_new_points`` with depth.
     """
 
     candidates: int = 4
@@ -33,6 +38,9 @@ class RelocalisationConfig:
     reprojection_px: float = 4.0
     patience_frames: int = 10
     min_new_points: int = 100
+    near_m: float = 0.5
+    max_speed_m_s: float = 3.0
+    drift_m_per_m: float = 0.05
     match: MatchConfig = field(
         default_factory=lambda: MatchConfig(max_distance=110, ratio=0.85, max_angle_rad=0.5)
     )
@@ -40,18 +48,20 @@ class RelocalisationConfig:
 
 def relocalise(
     features: Features,
-    candidates: list[Keyframe],
-    world: WorldMap,
+    keyframes: list[Keyframe],
+    map_reader: MapReader,
     tracker: Tracker,
     config: RelocalisationConfig,
     local_map: LocalMapConfig,
 ) -> Tracked | None:
-    """The frame tracked against the first candidate that fits; None if none does.
+    """The frame tracked against the most similar of the keyframes that fits; None if none does.
 
     Descriptors are matched without a prior, the pose is found by P3P in RANSAC (OpenCV, whose
     random numbers are seeded, so that runs repeat), then refined on that keyframe's local map.
     """
-    for keyframe in candidates[: config.candidates]:
+    world = map_reader.world
+    similar = similar_keyframes(features, keyframes, map_reader.places, config.min_votes)
+    for keyframe in similar[: config.candidates]:
         T_world_camera = _pose_from(keyframe, features, world, tracker, config)
         if T_world_camera is None:
             continue
@@ -62,6 +72,27 @@ def relocalise(
         if tracked.status is not TrackingStatus.LOST and enough:
             return tracked
     return None
+
+
+def is_within_reach(
+    motion: MotionModel,
+    T_world_camera: Array,
+    world: WorldMap,
+    ends: tuple[Keyframe, Keyframe | None],
+    config: RelocalisationConfig,
+) -> bool:
+    """Whether the camera can be at a pose (4, 4) after its last one, for all that the map drifts.
+
+    Of several rooms that look alike each is recognised as easily as the one that the camera is in.
+    ``ends`` are the keyframes near the pose and near the last one. All is within reach where there
+    is no last one.
+    """
+    moved_m = np.linalg.norm(T_world_camera[:3, 3] - motion.T_world_last[:3, 3])
+    beyond_m = moved_m - config.near_m - config.max_speed_m_s * motion.ago_s
+    if not beyond_m > 0 or ends[1] is None:  # NaN where the last pose has no time
+        return True
+    way_m = CovisiblePaths(world).between(ends[0].id, ends[1].id)[1]
+    return bool(beyond_m < config.drift_m_per_m * way_m)
 
 
 def similar_keyframes(

@@ -97,7 +97,7 @@ def test_segments_are_kept_apart_until_one_is_recognised_in_the_other() -> None:
     system = SlamSystem(CAMERA, SystemConfig(FeatureConfig(max_keypoints=400)))
     here, other_path = path(12, start_x_m=-1.6), path(14, start_x_m=1.4)
     back = [path(1, start_x_m=x)[0] for x in np.arange(1.4, -1.61, -0.045)]
-    poses = [*here, *[None] * 11, *other_path]
+    poses = [*here, *[None] * 40, *other_path]  # time enough to walk 3 m
     results = process_views(system, poses)
     assert results[-1].segment == 1
     apart = system.segments()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from synthetic_view import (
     CAMERA,
     T_NEW_OLD,
@@ -15,7 +16,7 @@ from synthetic_view import (
 from bmask_slam.back_end.config import BackEndConfig
 from bmask_slam.back_end.landmark_management import MappingConfig
 from bmask_slam.back_end.mapper import Mapper
-from bmask_slam.back_end.segment_joining import join_segment
+from bmask_slam.back_end.segment_joining import can_join, join_segment
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.factors.graph_update import (
     ANCHOR,
@@ -29,6 +30,7 @@ from bmask_slam.graph.factors.graph_update import (
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.inertial.tables import ImuModel, InertialFactor, InertialUpdate
 from bmask_slam.sensing.reference_frame import RETIRED_FRAME
+from bmask_slam.tracking.relocalisation import RelocalisationConfig
 from bmask_slam.tracking.results import Tracked, TrackingStatus
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 from bmask_slam.world.world_map import WorldMap
@@ -92,6 +94,25 @@ def test_landmarks_at_one_keypoint_are_fused() -> None:
     by_keypoint = dict(zip(joined.keypoints.tolist(), joined.landmark_ids.tolist(), strict=True))
     assert [by_keypoint[k] for k in (5, 15, 35)] == [5, 15, 55]
     assert np.allclose(joined.T_world_camera @ inverse(T_WORLD_SECOND), np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "apart_m", "possible"),
+    [(0.1, 0.2, True), (0.1, 3.0, False), (1.5, 3.0, True), (-60.0, 3.0, True)],
+)
+def test_segments_are_joined_where_the_camera_can_have_come_in_time(
+    gap_s: float, apart_m: float, possible: bool
+) -> None:
+    """0.5 m, and 3 m/s; stamps that go back are of another recording."""
+    world, _, second = two_segments()
+    old, new = world.keyframes.values()
+    new.timestamp_s = old.timestamp_s + gap_s
+    own_rows, own_ids = world.observed(new)
+    known_rows, known_ids = world.observed(old)
+    T_here = T_WORLD_FIRST @ se3_exp(np.array([0, 0, 0, apart_m, 0, 0]))
+    own = tracked(new.T_world_camera, second, own_rows, own_ids)
+    found = tracked(T_here, second, known_rows, known_ids)
+    assert can_join(world, 1, own, found, RelocalisationConfig()) == possible
 
 
 def segments_with_few_points_in_common(common: int) -> tuple[Mapper, Tracked, Tracked]:

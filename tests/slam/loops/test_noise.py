@@ -15,6 +15,7 @@ from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
 from bmask_slam.loops.noise import LoopNoise, NoiseConfig
 from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.world.covisibility import CovisiblePaths
 from bmask_slam.world.world_map import WorldMap
 
 STATED = np.diag([2e-3, 1e-3, 1e-3, 2e-3, 4e-3, 6e-3]) ** 2
@@ -103,7 +104,7 @@ def test_right_loops_are_not_refused_for_errors_that_their_inliers_share() -> No
     world = turning_world(0.01)
     closer = LoopCloser(CAMERA, LoopClosingConfig(), EventLog())
     right = noisy_loops(world, NoiseConfig().prior_ratio)
-    assert all(closer._within_drift(loop, world) for loop in right)
+    assert all(closer._within_drift(loop, world, CovisiblePaths(world)) for loop in right)
 
 
 @pytest.mark.parametrize(("a", "b", "fits"), [(0, 60, True), (0, 3, False)])
@@ -114,9 +115,9 @@ def test_a_map_may_be_bent_by_turns_not_without(a: int, b: int, fits: bool) -> N
     T_a_b = inverse(world.keyframes[a].T_world_camera) @ world.keyframes[b].T_world_camera
     T_bent = T_a_b @ se3_exp([0.03, 0.0, 0.04, -0.01, 0.04, 0.0])
     loop = replace(noisy_loops(world, 1.0, 1)[0], keyframe_a=a, keyframe_b=b, T_a_b=T_bent)
-    assert closer._within_drift(loop, world) == fits
+    assert closer._within_drift(loop, world, CovisiblePaths(world)) == fits
     alias = replace(loop, T_a_b=T_a_b @ se3_exp([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))
-    assert not closer._within_drift(alias, world)
+    assert not closer._within_drift(alias, world, CovisiblePaths(world))
 
 
 def test_the_path_is_in_radians_and_metres() -> None:
@@ -136,3 +137,37 @@ def test_what_a_bent_map_adds_grows_with_the_change_and_has_units() -> None:
     sigmas = np.sqrt(np.diagonal(noise.bent(poses), axis1=1, axis2=2))
     np.testing.assert_allclose(sigmas[0], np.repeat([0.023, 0.005], 3))
     np.testing.assert_allclose(sigmas[1], np.repeat([0.003, 0.045], 3))
+
+
+@pytest.mark.parametrize(
+    ("way", "sigma_rad", "sigma_m"),
+    [
+        ((0.0, 0.0, 0.0), 0.003, 0.005),
+        ((1.0, 0.0, 0.0), 0.023, 0.025),
+        ((0.0, 1.0, 1.0), np.hypot(0.003, 0.005), np.hypot(0.005, np.hypot(0.02, 0.0025))),
+        ((0.0, 100.0, 30.0), np.hypot(0.003, 0.1), np.hypot(0.005, np.hypot(0.4, 1.5))),
+    ],
+)
+def test_drift_grows_with_the_root_of_a_long_way(
+    way: tuple[float, ...], sigma_rad: float, sigma_m: float
+) -> None:
+    sigmas = np.sqrt(np.diagonal(LoopNoise(NoiseConfig()).possible_drift(np.array(way))))
+    np.testing.assert_allclose(sigmas, np.repeat([sigma_rad, sigma_m], 3))
+
+
+def test_a_room_that_looks_like_another_is_no_loop() -> None:
+    """6 m beside where the camera is, after a walk of 26 m and 13 rad between the two."""
+    world = WorldMap()
+    nothing = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
+    for k in range(27):
+        x_m = k if k < 16 else 32 - k  # there and part of the way back
+        add_keyframe(
+            world, se3_exp([0, 0, 0, x_m, 0, 0]) @ se3_exp([0, 0.5 * k, 0, 0, 0, 0]), nothing
+        )
+    closer = LoopCloser(CAMERA, LoopClosingConfig(), EventLog())
+    a, b = (world.keyframes[k].T_world_camera for k in (0, 26))
+    paths, loop = CovisiblePaths(world), noisy_loops(turning_world(0.01), 1.0, 1)[0]
+    for apart_m, fits in ((0.5, True), (6.15, False)):
+        T_a_b = inverse(a) @ se3_exp([0, 0, 0, 0, 0, apart_m]) @ b
+        found = replace(loop, keyframe_a=0, keyframe_b=26, T_a_b=T_a_b)
+        assert closer._within_drift(found, world, paths) == fits

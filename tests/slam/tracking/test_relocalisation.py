@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from synthetic_view import CAMERA, render_plane
@@ -11,7 +14,13 @@ from bmask_slam.features.brisk import BriskExtractor, FeatureConfig
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
-from bmask_slam.tracking.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
+from bmask_slam.tracking.motion_model import MotionModel
+from bmask_slam.tracking.relocalisation import (
+    RelocalisationConfig,
+    is_within_reach,
+    relocalise,
+    similar_keyframes,
+)
 from bmask_slam.tracking.results import Tracked
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 from bmask_slam.world.local_map import LocalMapConfig
@@ -50,8 +59,8 @@ def places(world: WorldMap) -> DescriptorIndex:
 
 def find(world: WorldMap, T_world_camera: Array) -> Tracked | None:
     features = EXTRACTOR.extract(render_plane(T_world_camera))
-    candidates = similar_keyframes(features, list(world.keyframes.values()), places(world), 2.0)
-    return relocalise(features, candidates, world, TRACKER, *RULES)
+    known: Any = SimpleNamespace(world=world, places=places(world))
+    return relocalise(features, list(world.keyframes.values()), known, TRACKER, *RULES)
 
 
 @pytest.mark.parametrize("turn_rad", [0.0, 0.5])
@@ -74,3 +83,21 @@ def test_the_most_similar_keyframe_comes_first(world: WorldMap) -> None:
     features = EXTRACTOR.extract(render_plane(at(1.0)))
     keyframes = list(world.keyframes.values())
     assert similar_keyframes(features, keyframes, places(world), 2.0)[0].id == 1
+
+
+@pytest.mark.parametrize(
+    ("lost_s", "x_m", "reached"),
+    [(0.1, 0.9, True), (0.1, 1.2, False), (0.5, 1.2, True), (0.5, 2.4, False), (1.0, 2.4, True)],
+)
+def test_a_pose_is_within_reach_by_speed_and_drift(
+    world: WorldMap, lost_s: float, x_m: float, reached: bool
+) -> None:
+    """0.5 m, 3 m/s, and 5 % of the 2.4 m between the keyframes."""
+    near, far = world.keyframes.values()
+    motion = MotionModel()
+    assert is_within_reach(motion, at(9.0), world, (near, far), RULES[0])  # there is no last pose
+    motion.now_s = 5.0
+    motion.advance(at(0.0), at(0.0), steady=True)
+    motion.now_s = 5.0 + lost_s
+    assert is_within_reach(motion, at(x_m), world, (near, far), RULES[0]) == reached
+    assert is_within_reach(motion, at(x_m), world, (near, None), RULES[0])

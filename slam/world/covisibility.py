@@ -1,0 +1,76 @@
+"""Ways through a map over keyframes that see the same landmarks."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.geometry import inverse, so3_log
+from bmask_slam.world.world_map import WorldMap
+
+MIN_SHARED = 15
+"""Keyframes are neighbours if they share so many landmarks, or follow each other in a segment."""
+METRES_PER_RAD = 1.0
+"""As much path counts a turn when ways are compared."""
+
+
+class CovisiblePaths:
+    """The shortest ways between the keyframes of a map as it is now.
+
+    A place that was seen again by its own landmarks ends the drift that was gathered since: between
+    two rooms the map can drift on the way from door to door, however long each was walked through.
+    """
+
+    def __init__(self, world: WorldMap) -> None:
+        """Nothing is computed before the first way is asked for."""
+        self._world = world
+
+    def between(self, a: int, b: int) -> Array:
+        """The shortest way between keyframes (3,): radians, metres, and how far it leads away.
+
+        The last are the metres from a to the furthest keyframe on it. All are inf if there is none.
+        """
+        ids, poses, costs = self._graph
+        here, source = np.searchsorted(ids, [a, b]).tolist()
+        _, before = dijkstra(costs, directed=False, indices=source, return_predecessors=True)
+        if here != source and before[here] < 0:
+            return np.full(3, np.inf)
+        way = [here]
+        while way[-1] != source:
+            way.append(int(before[way[-1]]))
+        away_m = np.linalg.norm(poses[way, :3, 3] - poses[here, :3, 3], axis=1).max()
+        return np.append(_lengths(poses[way[:-1]], poses[way[1:]]).sum(axis=0), away_m)
+
+    @cached_property
+    def _graph(self) -> tuple[Ints, Array, csr_array]:
+        """Ids (K,), T_world_camera (K, 4, 4), and what steps between neighbours (K, K) cost."""
+        world = self._world
+        ids = np.fromiter(world.keyframes, np.int64)
+        poses = np.array([k.T_world_camera for k in world.keyframes.values()])
+        observed = [world.observed(k)[1] for k in world.keyframes.values()]
+        rows = np.repeat(np.arange(len(ids)), [len(o) for o in observed])
+        columns = np.concatenate(observed)
+        shape = len(ids), len(world.landmarks) + 1
+        sees = csr_array((np.ones(len(rows), np.int32), (rows, columns)), shape)
+        shared = (sees @ sees.T).tocoo()
+        strong = (shared.data >= MIN_SHARED) & (shared.row < shared.col)
+        segments = np.array([k.segment for k in world.keyframes.values()])
+        order = np.argsort(segments, kind="stable")
+        same = segments[order[1:]] == segments[order[:-1]]
+        first = np.concatenate([shared.row[strong], order[:-1][same]])
+        second = np.concatenate([shared.col[strong], order[1:][same]])
+        pairs = np.unique(np.stack([first, second], axis=1), axis=0)
+        lengths = _lengths(poses[pairs[:, 0]], poses[pairs[:, 1]])
+        costs = lengths @ [METRES_PER_RAD, 1.0] + 1e-9  # a cost of 0 would be no step
+        return ids, poses, csr_array((costs, pairs.T), (len(ids), len(ids)))
+
+
+def _lengths(T_world_a: Array, T_world_b: Array) -> Array:
+    """Radians and metres (N, 2) of the steps from poses (N, 4, 4) to others."""
+    turns = np.linalg.norm(so3_log((inverse(T_world_a) @ T_world_b)[:, :3, :3]), axis=1)
+    moves = np.linalg.norm(T_world_b[:, :3, 3] - T_world_a[:, :3, 3], axis=1)
+    return np.stack([turns, moves], axis=1)

@@ -1,0 +1,60 @@
+"""The shortest way through a map over keyframes that see the same landmarks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic_view import add_keyframe, make_features
+
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.world.covisibility import MIN_SHARED, CovisiblePaths
+from bmask_slam.world.world_map import Keyframe, WorldMap
+
+COUNT = 12
+
+
+def out_and_back() -> tuple[WorldMap, list[Keyframe]]:
+    """Six steps of 1 m along x, a turn of 180 degrees in two, and four steps back."""
+    world = WorldMap()
+    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (60, 3))
+    features = make_features(np.eye(4), points, np.zeros((60, 8), np.uint64))
+    places = [0, 1, 2, 3, 4, 5, 5, 5, 4, 3, 2, 1]
+    turns = np.clip(np.arange(COUNT) - 5, 0, 2) * np.pi / 2
+    turned = [se3_exp([0, turn, 0, 0, 0, 0]) for turn in turns]
+    poses = [se3_exp([0, 0, 0, x, 0, 0]) @ T for x, T in zip(places, turned, strict=True)]
+    return world, [add_keyframe(world, T, features) for T in poses]
+
+
+def test_without_common_landmarks_the_way_is_that_of_the_camera() -> None:
+    world, _ = out_and_back()
+    paths = CovisiblePaths(world)
+    np.testing.assert_allclose(paths.between(0, COUNT - 1), [np.pi, 9, 5], atol=1e-9)
+    np.testing.assert_allclose(paths.between(COUNT - 1, 2), [np.pi, 7, 4], atol=1e-9)
+    np.testing.assert_allclose(paths.between(3, 3), [0, 0, 0])
+
+
+@pytest.mark.parametrize("shared", [MIN_SHARED - 1, MIN_SHARED])
+def test_landmarks_that_were_seen_again_make_it_shorter(shared: int) -> None:
+    world, keyframes = out_and_back()
+    rows = np.arange(shared)
+    ids = world.make_landmarks(keyframes[2], rows, np.ones((shared, 3)))
+    world.attach(keyframes[10], rows, ids)  # where it was before, looking the other way
+    turned, walked, away = CovisiblePaths(world).between(0, COUNT - 1)
+    assert turned == pytest.approx(np.pi)
+    assert (walked, away) == pytest.approx((3, 2) if shared == MIN_SHARED else (9, 5))
+
+
+def test_culled_keyframes_are_stepped_over() -> None:
+    world, keyframes = out_and_back()
+    world.remove_keyframe(keyframes[3], keyframes[2])
+    np.testing.assert_allclose(CovisiblePaths(world).between(0, 5), [0, 5, 5], atol=1e-9)
+
+
+def test_segments_have_no_way_between_them() -> None:
+    world, keyframes = out_and_back()
+    for keyframe in keyframes[4:8]:
+        keyframe.segment = 1
+    paths = CovisiblePaths(world)
+    assert np.isinf(paths.between(0, 5)).all()
+    np.testing.assert_allclose(paths.between(4, 6), [np.pi / 2, 1, 1], atol=1e-9)
+    np.testing.assert_allclose(paths.between(3, 8), [np.pi, 1, 1], atol=1e-9)
