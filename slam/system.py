@@ -270,7 +270,7 @@ class SlamSystem(SensorSystem):
         if not others or not world.in_segment(tracker.segment):
             return tracked
         rules, found = self.config.relocalisation, tracker.recognise(tracked.features, others)
-        if found is not None and can_join(world, tracker.segment, tracked, found, rules):
+        if found is not None and can_join(self.map, tracker.segment, tracked, found, rules):
             joined = self.mapper.join(tracker.segment, tracked, found)
         elif (T := join_by_markers(self.mapper, tracker.segment)) is not None:
             joined = replace(tracked, T_world_camera=T @ tracked.T_world_camera)

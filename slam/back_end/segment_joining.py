@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from bmask_slam.back_end.map_backend import MapBackend
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_update import ANCHOR, RelativePose
 from bmask_slam.graph.factors.observability import diagonal_covariance
@@ -42,7 +43,7 @@ def join_segment(world: WorldMap, segment: int, tracked: Tracked, recognised: Tr
 
 
 def can_join(
-    world: WorldMap,
+    back_end: MapBackend,
     segment: int,
     tracked: Tracked,
     recognised: Tracked,
@@ -51,17 +52,22 @@ def can_join(
     """Whether a camera can have moved as ``join_segment`` would say, between the two segments.
 
     Of several rooms that look alike each is recognised as easily as the one that the camera is in;
-    but between the last keyframe before a segment and its first it moved as ``config`` allows for
-    a camera that is lost, with the drift of both segments.
+    but between the last frame before a segment and its first keyframe it moved as ``config`` allows
+    for a camera that is lost, with the drift of both segments.
     """
+    world = back_end.world
     T_other_segment = recognised.T_world_camera @ inverse(tracked.T_world_camera)
     _, nearest = world.covisible(recognised.landmark_ids, 1)[0]
     own = world.in_segment(segment)
     before = [k for k in world.in_segment(nearest.segment) if k.id < own[0].id]
-    gap_s = own[0].timestamp_s - before[-1].timestamp_s if before else -1.0
-    if gap_s < 0:  # another recording
-        return True
-    moved = T_other_segment @ own[0].T_world_camera - before[-1].T_world_camera
+    if not before or before[-1].timestamp_s > (begin_s := own[0].timestamp_s):
+        return True  # there is none, or it is of another recording
+    frames = back_end.history.path(world, nearest.segment, before[-1].timestamp_s, begin_s)
+    stamps_s = np.append(before[-1].timestamp_s, frames.timestamps_s)
+    poses = np.concatenate([before[-1].T_world_camera[None], frames.poses_world_camera])
+    last = np.flatnonzero(stamps_s < begin_s)[-1]
+    gap_s = begin_s - stamps_s[last]
+    moved = T_other_segment @ own[0].T_world_camera - poses[last]
     paths = CovisiblePaths(world)
     ways = paths.between(own[0].id, own[-1].id) + paths.between(before[-1].id, nearest.id)
     limit_m = config.near_m + config.max_speed_m_s * gap_s + config.drift_m_per_m * ways[1]

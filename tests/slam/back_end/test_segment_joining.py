@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from synthetic_view import (
@@ -33,6 +36,7 @@ from bmask_slam.sensing.reference_frame import RETIRED_FRAME
 from bmask_slam.tracking.relocalisation import RelocalisationConfig
 from bmask_slam.tracking.results import Tracked, TrackingStatus
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.world_map import WorldMap
 
 T_WORLD_FIRST = se3_exp(np.array([0.1, 0.2, -0.1, 0.3, 0.0, 0.2]))
@@ -112,7 +116,13 @@ def test_segments_are_joined_where_the_camera_can_have_come_in_time(
     T_here = T_WORLD_FIRST @ se3_exp(np.array([0, 0, 0, apart_m, 0, 0]))
     own = tracked(new.T_world_camera, second, own_rows, own_ids)
     found = tracked(T_here, second, known_rows, known_ids)
-    assert can_join(world, 1, own, found, RelocalisationConfig()) == possible
+    history = FrameHistory()
+    back_end: Any = SimpleNamespace(world=world, history=history)
+    assert can_join(back_end, 1, own, found, RelocalisationConfig()) == possible
+    if gap_s > 1:  # a frame that was tracked after the last keyframe leaves less time
+        poses = old.T_world_camera, T_WORLD_FIRST
+        history.append(old.timestamp_s + gap_s - 0.1, old.id, *poses)
+        assert not can_join(back_end, 1, own, found, RelocalisationConfig())
 
 
 def segments_with_few_points_in_common(common: int) -> tuple[Mapper, Tracked, Tracked]:
