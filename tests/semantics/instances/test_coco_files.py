@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pycocotools import mask as coco_mask
-from repository import SHARED
+from repository import shared
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.coco_files import decoded_lengths, read_coco
@@ -139,7 +139,7 @@ def test_compressed_run_lengths_are_decoded(lengths: list[int]) -> None:
 
 
 def test_the_real_excerpt() -> None:
-    content = read_coco(SHARED / "coco_excerpt" / "instances.json")
+    content = read_coco(shared("coco_excerpt/instances.json"))
     assert len(content.images) == 355
     assert len(content.labels) == 81
     found = sum(len(image.objects) for image in content.images)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from repository import SHARED
+from repository import shared
 
 from bmask_slam.semantics.network.yolox.mask_scoring import MaskScoringYolox, _aligned, around
 from bmask_slam.semantics.network.yolox.network import Features
@@ -48,7 +48,7 @@ def test_boxes_of_several_images_get_their_own_features() -> None:
 
 def test_the_heads_learn_one_object_and_the_detector_does_not() -> None:
     torch.manual_seed(0)
-    model = new_light(load_onnx(SHARED / "weights" / "yolox_nano.onnx")).model
+    model = new_light(load_onnx(shared("weights/yolox_nano.onnx"))).model
     before = {k: v.clone() for k, v in model.detector.state_dict().items()}
     image = torch.rand(3, 96, 128) * 0.2
     mask = torch.zeros(1, 96, 128, dtype=torch.bool)

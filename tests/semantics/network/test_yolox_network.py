@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from repository import SHARED
+from repository import shared
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.image_files import read_colour
@@ -18,22 +18,22 @@ from bmask_slam.semantics.network.yolox.network import STRIDES, YoloxNano, decod
 from bmask_slam.semantics.network.yolox.selection import SelectionConfig, select, voted
 from bmask_slam.semantics.weights.yolox_onnx import load_onnx
 
-ONNX = SHARED / "weights" / "yolox_nano.onnx"
-PHOTOGRAPHS = SHARED / "coco_excerpt" / "images"
+ONNX = "weights/yolox_nano.onnx"
+PHOTOGRAPHS = "coco_excerpt/images"
 
 
 @pytest.fixture(scope="module")
 def network() -> YoloxNano:
-    return load_onnx(ONNX)
+    return load_onnx(shared(ONNX))
 
 
 @pytest.mark.parametrize("image", ["photograph", "noise"])
 def test_it_computes_what_the_published_file_computes(network: YoloxNano, image: str) -> None:
     if image == "photograph":
-        pixels = cv2.resize(read_colour(sorted(PHOTOGRAPHS.iterdir())[3]), (416, 416))
+        pixels = cv2.resize(read_colour(sorted(shared(PHOTOGRAPHS).iterdir())[3]), (416, 416))
     else:
         pixels = np.random.default_rng(0).integers(0, 256, (416, 416, 3), np.uint8)
-    published = cv2.dnn.readNetFromONNX(str(ONNX))
+    published = cv2.dnn.readNetFromONNX(str(shared(ONNX)))
     published.setInput(cv2.dnn.blobFromImage(pixels, swapRB=True))
     expected = torch.from_numpy(published.forward())
     with torch.inference_mode():
@@ -136,7 +136,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         load_onnx(tmp_path / "none.onnx")
     bad = tmp_path / "bad.onnx"
-    bad.write_bytes(ONNX.read_bytes()[:-1000])
+    bad.write_bytes(shared(ONNX).read_bytes()[:-1000])
     with pytest.raises(InputError, match="not an ONNX file that can be read"):
         load_onnx(bad)
     bad.write_bytes(b"\x3a\x00")  # a model with an empty graph

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from repository import SHARED
+from repository import shared
 
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
@@ -27,13 +27,13 @@ from bmask_slam.semantics.weights.light_weights import (
 from bmask_slam.semantics.weights.stuff_weights import SHIPPED, load_stuff, save_stuff
 from bmask_slam.semantics.weights.yolox_onnx import load_onnx
 
-PHOTOGRAPHS = SHARED / "coco_excerpt" / "images"
+PHOTOGRAPHS = "coco_excerpt/images"
 
 
 @pytest.fixture(scope="module")
 def network() -> LightNetwork:
     torch.manual_seed(0)
-    made = new_light(load_onnx(SHARED / "weights" / "yolox_nano.onnx"))
+    made = new_light(load_onnx(shared("weights/yolox_nano.onnx")))
     torch.nn.init.constant_(made.model.mask.logits.bias, 1.0)  # so that masks are not empty
     made.model.eval()
     return made
@@ -41,7 +41,7 @@ def network() -> LightNetwork:
 
 @pytest.fixture(scope="module")
 def photograph() -> np.ndarray:
-    return read_colour(sorted(PHOTOGRAPHS.iterdir())[0])
+    return read_colour(sorted(shared(PHOTOGRAPHS).iterdir())[0])
 
 
 def test_instances_lie_in_the_image_best_first(

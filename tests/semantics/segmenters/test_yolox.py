@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from repository import SHARED
+from repository import shared
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.coco_files import read_coco
@@ -17,19 +17,19 @@ from bmask_slam.semantics.network.boxes import iou
 from bmask_slam.semantics.network.yolox.selection import SelectionConfig
 from bmask_slam.semantics.segmenters.yolox import YoloxConfig, YoloxDetector, letterbox
 
-ONNX = SHARED / "weights" / "yolox_nano.onnx"
+ONNX = "weights/yolox_nano.onnx"
 
 
 @pytest.fixture(scope="module")
 def small() -> YoloxDetector:
     """At 416 pixels alone."""
-    return YoloxDetector(ONNX, YoloxConfig(mirror=False, sizes_px=(416,)))
+    return YoloxDetector(shared(ONNX), YoloxConfig(mirror=False, sizes_px=(416,)))
 
 
 @pytest.fixture(scope="module")
 def both() -> YoloxDetector:
     """At 416 and at 640 pixels."""
-    return YoloxDetector(ONNX, YoloxConfig(mirror=False, sizes_px=(416, 640)))
+    return YoloxDetector(shared(ONNX), YoloxConfig(mirror=False, sizes_px=(416, 640)))
 
 
 def test_the_letterbox_keeps_proportions() -> None:
@@ -43,10 +43,10 @@ def test_the_letterbox_keeps_proportions() -> None:
 
 
 def test_the_real_network_finds_large_objects_in_real_photographs(small: YoloxDetector) -> None:
-    content = read_coco(SHARED / "coco_excerpt" / "instances.json")
+    content = read_coco(shared("coco_excerpt/instances.json"))
     hits = total = 0
     for image in content.images[:12]:
-        pixels = read_colour(SHARED / "coco_excerpt" / "images" / image.file_name)
+        pixels = read_colour(shared("coco_excerpt/images") / image.file_name)
         found = small.detect(pixels, content.labels)
         torch.testing.assert_close(found.distributions.sum(1), torch.ones(len(found.boxes)))
         large = [o for o in image.objects if not o.crowd and o.mask().mean() > 0.05]
@@ -60,9 +60,9 @@ def test_the_real_network_finds_large_objects_in_real_photographs(small: YoloxDe
 
 
 def test_with_the_mirror_image_a_mirrored_scene_has_the_mirrored_boxes() -> None:
-    detector = YoloxDetector(ONNX, YoloxConfig(SelectionConfig(min_score=0.2)))
+    detector = YoloxDetector(shared(ONNX), YoloxConfig(SelectionConfig(min_score=0.2)))
     labels = read_label_set("coco")
-    image = read_colour(sorted((SHARED / "coco_excerpt" / "images").iterdir())[0])
+    image = read_colour(sorted(shared("coco_excerpt/images").iterdir())[0])
     one = detector.detect(image, labels)
     other = detector.detect(np.ascontiguousarray(image[:, ::-1]), labels)
     assert len(one.boxes) > 0
@@ -76,10 +76,10 @@ def test_with_the_mirror_image_a_mirrored_scene_has_the_mirrored_boxes() -> None
 def test_a_second_input_size_finds_more_small_objects(
     small: YoloxDetector, both: YoloxDetector
 ) -> None:
-    content = read_coco(SHARED / "coco_excerpt" / "instances.json")
+    content = read_coco(shared("coco_excerpt/instances.json"))
     hits = {small: 0, both: 0}
     for image in content.images[:8]:
-        pixels = read_colour(SHARED / "coco_excerpt" / "images" / image.file_name)
+        pixels = read_colour(shared("coco_excerpt/images") / image.file_name)
         objects = [o for o in image.objects if not o.crowd and o.mask().sum() < 48**2]
         for detector in hits:
             found = detector.detect(pixels, content.labels)
@@ -91,7 +91,7 @@ def test_a_second_input_size_finds_more_small_objects(
 
 
 def test_only_classes_of_the_label_set_are_found(both: YoloxDetector) -> None:
-    image = read_colour(sorted((SHARED / "coco_excerpt" / "images").iterdir())[0])
+    image = read_colour(sorted(shared("coco_excerpt/images").iterdir())[0])
     assert len(both.detect(image, label_set(["drone"])).boxes) == 0
     paper = read_label_set("paper")
     assert paper.number("tv") == 18
@@ -106,4 +106,4 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         YoloxDetector(tmp_path / "none.onnx")
     with pytest.raises(InputError, match="not a YOLOX network"):
-        YoloxDetector(ONNX, YoloxConfig(sizes_px=(100,)))
+        YoloxDetector(shared(ONNX), YoloxConfig(sizes_px=(100,)))

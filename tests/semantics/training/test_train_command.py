@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from repository import SHARED
+from repository import shared
 
 from bmask_slam.cli import main
 from bmask_slam.graph.data_files import data_path
@@ -24,7 +24,7 @@ from bmask_slam.semantics.weights.light_weights import SHIPPED, load_light
 @pytest.fixture
 def few(tmp_path: Path) -> Path:
     """The first four photographs of the excerpt that show a person."""
-    content = json.loads((SHARED / "coco_excerpt" / "instances.json").read_text())
+    content = json.loads(shared("coco_excerpt/instances.json").read_text())
     people = {a["image_id"] for a in content["annotations"] if a["category_id"] == 1}
     chosen = sorted(people)[:4]
     content["images"] = [i for i in content["images"] if i["id"] in chosen]
@@ -36,7 +36,7 @@ def few(tmp_path: Path) -> Path:
 def test_new_heads_of_the_light_network_are_trained(
     few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    images = str(SHARED / "coco_excerpt" / "images")
+    images = str(shared("coco_excerpt/images"))
     command = ["train", "--data", str(few), "--images", images, "--quiet"]
     command += ["--steps", "1", "--batch", "1", "--out", str(tmp_path / "out")]
     assert main(command) == 0
@@ -55,7 +55,7 @@ def test_a_network_on_mobilenet_is_trained_and_resumed(
 ) -> None:
     small = replace(LIGHT, image=replace(LIGHT.image, short_px=120, long_px=200))
     monkeypatch.setattr(run, "LIGHT", small)
-    images = str(SHARED / "coco_excerpt" / "images")
+    images = str(shared("coco_excerpt/images"))
     command = ["train", "--data", str(few), "--images", images, "--labels", "paper", "--quiet"]
     command += [
         "--steps",
@@ -69,7 +69,7 @@ def test_a_network_on_mobilenet_is_trained_and_resumed(
         "--freeze",
         "backbone.body",
     ]
-    body = str(SHARED / "weights" / "mobilenet_v2_imagenet_folded.pth")
+    body = str(shared("weights/mobilenet_v2_imagenet_folded.pth"))
     out = tmp_path / "first"
     assert main([*command, "--backbone", body, "--out", str(out)]) == 0
     weights = Path(capsys.readouterr().out.strip())
@@ -97,7 +97,7 @@ def test_a_network_on_mobilenet_is_trained_and_resumed(
 def test_incompatible_options_are_rejected(
     few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], extra: list[str], words: str
 ) -> None:
-    images = str(SHARED / "coco_excerpt" / "images")
+    images = str(shared("coco_excerpt/images"))
     out = tmp_path / "out"
     command = ["train", "--data", str(few), "--images", images, "--out", str(out), "--quiet"]
     assert main([*command, *extra]) == 1

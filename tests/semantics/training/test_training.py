@@ -8,7 +8,7 @@ from typing import Literal, cast
 import numpy as np
 import pytest
 import torch
-from repository import SHARED
+from repository import shared
 
 from bmask_slam.semantics.network.box_head import ClassifiedBoxes
 from bmask_slam.semantics.network.config import DetectionConfig, ImageConfig, NetworkConfig
@@ -29,7 +29,6 @@ from bmask_slam.semantics.training.targets import (
 )
 from bmask_slam.semantics.weights.checkpoints import load_mobilenet
 
-WEIGHTS = SHARED / "weights"
 TINY = NetworkConfig(
     classes=3, backbone="mobilenet_v2", norm="none", channels=24, box_hidden=32, mask_channels=16,
     maskiou_channels=16, maskiou_hidden=32, image=ImageConfig(96, 128),
@@ -162,7 +161,7 @@ def learner() -> MaskRCNN:
     """A tiny network on the real MobileNetV2, which is not trained."""
     torch.manual_seed(0)
     model = MaskRCNN(TINY)
-    load_mobilenet(model, WEIGHTS / "mobilenet_v2_imagenet_folded.pth")
+    load_mobilenet(model, shared("weights/mobilenet_v2_imagenet_folded.pth"))
     model.backbone.body.requires_grad_(False)
     return model
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from repository import SHARED
+from repository import shared
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.coco_files import CocoFile, read_coco
@@ -135,13 +135,13 @@ def test_classes_are_matched_by_name(data: tuple[CocoFile, Path]) -> None:
 
 
 def test_the_split_of_the_real_excerpt_separates_images() -> None:
-    content = read_coco(SHARED / "coco_excerpt" / "instances.json")
+    content = read_coco(shared("coco_excerpt/instances.json"))
     training, validation = split(content, 0.28, seed=0)
     assert (len(training.images), len(validation.images)) == (256, 99)
     assert not {i.number for i in training.images} & {i.number for i in validation.images}
     assert split(content, 0.28, seed=0)[1] == validation
     assert split(content, 0.28, seed=1)[1] != validation
-    paper = Dataset(training, SHARED / "coco_excerpt" / "images", read_label_set("paper"))
+    paper = Dataset(training, shared("coco_excerpt/images"), read_label_set("paper"))
     assert 0 < len(paper) < 256
 
 
@@ -197,8 +197,8 @@ def test_only_trainable_parameters_change(data: tuple[CocoFile, Path], tmp_path:
 
 def test_the_body_of_an_imagenet_classifier(tmp_path: Path) -> None:
     model = network().model
-    load_mobilenet(model, SHARED / "weights" / "mobilenet_v2_imagenet_folded.pth")
-    file = torch.load(SHARED / "weights" / "mobilenet_v2_imagenet_folded.pth", weights_only=True)
+    load_mobilenet(model, shared("weights/mobilenet_v2_imagenet_folded.pth"))
+    file = torch.load(shared("weights/mobilenet_v2_imagenet_folded.pth"), weights_only=True)
     state = model.state_dict()
     name = "features.17.conv.2.1.weight"
     assert torch.equal(state[f"backbone.body.{name}"], file[name])

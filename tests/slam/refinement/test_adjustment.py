@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from repository import KITCHEN
+from repository import KITCHEN, shared
 
 from bmask_slam import cli
 from bmask_slam.features.brisk import FeatureConfig
@@ -77,7 +77,9 @@ def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run over a part of the red kitchen, without the final adjustment."""
     out = tmp_path_factory.mktemp("runs") / "kitchen"
     config = SystemConfig(FeatureConfig(max_keypoints=500), final_adjustment=False)
-    return run(RunOptions(KITCHEN, config, out=out, max_frames=40, stride=2, quiet=True)).folder
+    return run(
+        RunOptions(shared("redkitchen"), config, out=out, max_frames=40, stride=2, quiet=True)
+    ).folder
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +167,12 @@ def test_the_saved_map_is_the_adjusted_one(kitchen: Path, adjusted: Path, tmp_pa
     config = SystemConfig(final_adjustment=False)
     for name in ("localise", "map"):
         options = RunOptions(
-            KITCHEN, config, out=tmp_path / name, max_frames=12, quiet=True, **{name: out}
+            shared("redkitchen"),
+            config,
+            out=tmp_path / name,
+            max_frames=12,
+            quiet=True,
+            **{name: out},
         )
         found = read_tum(run(options).folder / "trajectory.txt")
         expected = read_tum(out / "trajectory.txt")
