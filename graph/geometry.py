@@ -108,6 +108,13 @@ def so3_log(R: Array) -> Array:
     return scale[..., None] * q[..., :3]
 
 
+def step_lengths(T_world_a: Array, T_world_b: Array) -> Array:
+    """Radians and metres (N, 2) of the steps from poses (N, 4, 4) to others (N, 4, 4)."""
+    turns = np.linalg.norm(so3_log((inverse(T_world_a) @ T_world_b)[:, :3, :3]), axis=1)
+    moves = np.linalg.norm(T_world_b[:, :3, 3] - T_world_a[:, :3, 3], axis=1)
+    return np.stack([turns, moves], axis=1)
+
+
 def se3_exp(xi: Array) -> Array:
     """Rigid transforms (..., 4, 4) from tangents (..., 6) ``[rotation rad, translation m]``."""
     xi = np.asarray(xi, float)

@@ -70,8 +70,7 @@ def can_join(
     moved = T_other_segment @ own[0].T_world_camera - poses[last]
     paths = CovisiblePaths(world)
     ways = paths.between(own[0].id, own[-1].id) + paths.between(before[-1].id, nearest.id)
-    limit_m = config.near_m + config.max_speed_m_s * gap_s + config.drift_m_per_m * ways[1]
-    return bool(np.linalg.norm(moved[:3, 3]) < limit_m)
+    return bool(np.linalg.norm(moved[:3, 3]) < config.reach_m(gap_s, ways[1]))
 
 
 def move_segment(world: WorldMap, segment: int, T_other_segment: Array, target: int) -> None:

@@ -45,6 +45,10 @@ class RelocalisationConfig:
         default_factory=lambda: MatchConfig(max_distance=110, ratio=0.85, max_angle_rad=0.5)
     )
 
+    def reach_m(self, time_s: float, way_m: float = 0.0) -> float:
+        """How far a lost camera can have come in a time, over a way through the map."""
+        return self.near_m + self.max_speed_m_s * time_s + self.drift_m_per_m * way_m
+
 
 def relocalise(
     features: Features,
@@ -88,11 +92,10 @@ def is_within_reach(
     is no last one.
     """
     moved_m = np.linalg.norm(T_world_camera[:3, 3] - motion.T_world_last[:3, 3])
-    beyond_m = moved_m - config.near_m - config.max_speed_m_s * motion.ago_s
-    if not beyond_m > 0 or ends[1] is None:  # NaN where the last pose has no time
+    if not moved_m > config.reach_m(motion.ago_s) or ends[1] is None:  # NaN: no time of a last pose
         return True
     way_m = CovisiblePaths(world).between(ends[0].id, ends[1].id)[1]
-    return bool(beyond_m < config.drift_m_per_m * way_m)
+    return bool(moved_m < config.reach_m(motion.ago_s, way_m))
 
 
 def similar_keyframes(

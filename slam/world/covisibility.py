@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from bmask_slam.graph.arrays import Array, Ints
-from bmask_slam.graph.geometry import inverse, so3_log
+from bmask_slam.graph.geometry import step_lengths
 from bmask_slam.world.world_map import WorldMap
 
 MIN_SHARED = 15
@@ -43,7 +43,7 @@ class CovisiblePaths:
         while way[-1] != source:
             way.append(int(before[way[-1]]))
         away_m = np.linalg.norm(poses[way, :3, 3] - poses[here, :3, 3], axis=1).max()
-        return np.append(_lengths(poses[way[:-1]], poses[way[1:]]).sum(axis=0), away_m)
+        return np.append(step_lengths(poses[way[:-1]], poses[way[1:]]).sum(axis=0), away_m)
 
     @cached_property
     def _graph(self) -> tuple[Ints, Array, csr_array]:
@@ -64,13 +64,6 @@ class CovisiblePaths:
         first = np.concatenate([shared.row[strong], order[:-1][same]])
         second = np.concatenate([shared.col[strong], order[1:][same]])
         pairs = np.unique(np.stack([first, second], axis=1), axis=0)
-        lengths = _lengths(poses[pairs[:, 0]], poses[pairs[:, 1]])
+        lengths = step_lengths(poses[pairs[:, 0]], poses[pairs[:, 1]])
         costs = lengths @ [METRES_PER_RAD, 1.0] + 1e-9  # a cost of 0 would be no step
         return ids, poses, csr_array((costs, pairs.T), (len(ids), len(ids)))
-
-
-def _lengths(T_world_a: Array, T_world_b: Array) -> Array:
-    """Radians and metres (N, 2) of the steps from poses (N, 4, 4) to others."""
-    turns = np.linalg.norm(so3_log((inverse(T_world_a) @ T_world_b)[:, :3, :3]), axis=1)
-    moves = np.linalg.norm(T_world_b[:, :3, 3] - T_world_a[:, :3, 3], axis=1)
-    return np.stack([turns, moves], axis=1)

@@ -12,7 +12,7 @@ from bmask_slam.features.patch_alignment import SubpixelConfig, cut_patches
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.disk_arrays import DiskRecords
-from bmask_slam.graph.geometry import inverse, so3_log, transform
+from bmask_slam.graph.geometry import step_lengths, transform
 from bmask_slam.world.landmark_table import LandmarkTable
 
 MAX_CULLED = 500
@@ -115,9 +115,7 @@ class WorldMap:
         """
         ids = np.fromiter(self.keyframes, np.int64)
         poses = np.array([k.T_world_camera for k in self.keyframes.values()])
-        turns = so3_log((inverse(poses[:-1]) @ poses[1:])[:, :3, :3])
-        moves = np.diff(poses[:, :3, 3], axis=0)
-        steps = np.stack([np.linalg.norm(turns, axis=1), np.linalg.norm(moves, axis=1)], axis=1)
+        steps = step_lengths(poses[:-1], poses[1:])
         return ids, np.cumsum(np.concatenate([np.zeros((1, 2)), steps]), axis=0)
 
     def observed(self, keyframe: Keyframe) -> tuple[Ints, Ints]:

@@ -87,11 +87,12 @@ def _decorated(
     b: SceneBuilder, like: SceneBuilder, hang: parts.Decorator, lighting: Lighting, number: int
 ) -> SceneBuilder:
     """A copy of a lit part with what this one alone has."""
-    part = SceneBuilder(int(b.rng.integers(2**31)), b.detail)
-    part.repeat(like)
-    hang(part, number)
-    part.parts = bake(part.parts, lighting, number)
-    return part
+
+    def make(part: SceneBuilder) -> None:
+        part.repeat(like)
+        hang(part, number)
+
+    return _lit(b, make, lighting, number)
 
 
 def _T_storey_room(number: int) -> Array:
