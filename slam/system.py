@@ -30,7 +30,7 @@ from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.keyframe_decision import KeyframeDecision
 from bmask_slam.tracking.results import FrameResult, Tracked, TrackingStatus
 from bmask_slam.tracking.tracker import Tracker
-from bmask_slam.world.world_map import Keyframe
+from bmask_slam.world.keyframe import Keyframe
 
 logger = logging.getLogger(__name__)
 

@@ -25,7 +25,8 @@ from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 SNAPSHOT_FRAMES = 50
 TURN_RAD, SHIFT_M = 0.5, 2.0  # sigmas of a wrong loop, an axis

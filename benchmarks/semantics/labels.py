@@ -43,7 +43,7 @@ from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
 from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.world.world_map import Keyframe
+from bmask_slam.world.keyframe import Keyframe
 
 MIN_PIXELS = 300
 MIN_IOU = 0.25

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +11,8 @@ from bmask_slam.features.brisk import Features, spread_order
 from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
 from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, PosePrior, concatenate
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,8 @@ class FactorSelectionConfig:
 class FactorSelector:
     """Turns changes of the map into updates of the graph and estimates back into the map.
 
-    ``depth_factor`` is the camera's ``graph_depth_factor``.
+    ``depth_factor`` is the camera's ``graph_depth_factor``. An update looks only at keyframes of
+    which something changed: its cost does not grow with the map.
     """
 
     def __init__(self, config: FactorSelectionConfig, depth_factor: float = 1.0):
@@ -45,6 +48,7 @@ class FactorSelector:
         self._depth_factor = depth_factor
         self._removed: list[Ints] = []
         self._removed_keyframes: list[int] = []
+        self._forget()
 
     def remove_landmarks(self, ids: Ints) -> None:
         """Remove the factors of culled or fused landmarks with the next update."""
@@ -65,6 +69,14 @@ class FactorSelector:
         """Go on from a state."""
         self._removed = [state["removed"]]
         self._removed_keyframes = state["removed_keyframes"].tolist()
+        self._forget()
+
+    def _forget(self) -> None:
+        """Nothing is known of the map, so that the next update looks at all of it."""
+        self._were_in_graph: Mask = np.zeros(0, bool)
+        self._sent: Mask | None = None
+        self._waiting: set[int] = set()
+        """Keyframes that observe marginalised landmarks more often than the graph was told."""
 
     def keyframe_update(self, world: WorldMap, keyframe: Keyframe) -> GraphUpdate:
         """The update that adds one keyframe and its landmarks, with every other change."""
@@ -74,7 +86,8 @@ class FactorSelector:
         world.landmarks.in_graph[new_ids] = True
         marginalised = self._outside_window(world, ids)
         world.landmarks.in_graph[marginalised] = False
-        begins = world.in_segment(keyframe.segment) == [keyframe]
+        same = (k for k in world.keyframes.values() if k.segment == keyframe.segment)
+        begins = next(same) is keyframe
         return replace(
             self._changes(world),
             keyframe_ids=np.array([keyframe.id]),
@@ -90,12 +103,21 @@ class FactorSelector:
 
         Marginalised landmarks that were given observations enter the graph again.
         """
-        again = np.flatnonzero(was_sent(world) & ~world.landmarks.in_graph & world.landmarks.in_map)
-        unsent = [k.landmark_ids[k.sent_ids != k.landmark_ids] for k in world.keyframes.values()]
-        again = np.intersect1d(again, np.concatenate([np.zeros(0, np.int64), *unsent]))
+        again = self._marginalised_with_more(world)
         world.landmarks.in_graph[again] = True
         points = world.landmarks.points_world[again]
         return replace(self._changes(world), landmark_ids=again, points_world=points)
+
+    def _marginalised_with_more(self, world: WorldMap) -> Ints:
+        """Landmarks of the map that were sent, left the graph, and have unsent observations."""
+        unsent = [np.zeros(0, np.int64)]
+        for k in (self._waiting | world.changed) & world.keyframes.keys():
+            keyframe = world.keyframes[k]
+            unsent.append(keyframe.landmark_ids[keyframe.sent_ids != keyframe.landmark_ids])
+        self._waiting.clear()
+        ids = world.landmarks.remaining(np.unique(np.concatenate(unsent)))
+        ids = ids[~world.landmarks.in_graph[ids]]
+        return ids[was_sent(world, world.observing(ids))[ids]]
 
     def _changes(self, world: WorldMap) -> GraphUpdate:
         update = GraphUpdate(
@@ -111,10 +133,12 @@ class FactorSelector:
         self._removed, self._removed_keyframes = [], []
         keyframes = list(world.keyframes.values())
         landmarks = world.landmarks
-        landmarks.in_graph[:] = (landmarks.in_graph | was_sent(world)) & landmarks.in_map
+        landmarks.in_graph[:] |= was_sent(world, keyframes)
+        landmarks.in_graph[:] &= landmarks.in_map
         first = {k.segment: k for k in reversed(keyframes)}
         for keyframe in keyframes:
             keyframe.sent_ids[:] = -1
+        world.changed.update(world.keyframes)
         ids = np.flatnonzero(landmarks.in_graph)
         return GraphUpdate(
             keyframe_ids=np.array([k.id for k in keyframes]),
@@ -160,23 +184,47 @@ class FactorSelector:
     def _unsent_observations(self, world: WorldMap) -> Observations:
         """Every observation of a landmark in the graph that was not sent yet, in all keyframes.
 
-        Observations that older keyframes gained by fusion are among them.
+        Observations that older keyframes gained by fusion are among them, and all of a landmark
+        that enters.
         """
         in_graph = np.append(world.landmarks.in_graph, False)  # the last entry is for id -1
+        sent = self._ever_sent(world)
+        entered = in_graph.copy()
+        entered[: len(self._were_in_graph)] &= ~self._were_in_graph
+        self._were_in_graph = in_graph[:-1]
+        concerned = {k.id for k in world.observing(np.flatnonzero(entered))} | world.changed
+        world.changed.clear()
         parts = []
-        for keyframe in world.keyframes.values():
+        for k in sorted(concerned & world.keyframes.keys()):
+            keyframe = world.keyframes[k]
             ids = keyframe.landmark_ids
-            rows = np.flatnonzero(in_graph[ids] & (keyframe.sent_ids != ids))
+            unsent = keyframe.sent_ids != ids
+            rows = np.flatnonzero(in_graph[ids] & unsent)
             if len(rows):
                 parts.append(observations_of(keyframe, rows, ids[rows], self._depth_factor))
                 keyframe.sent_ids[rows] = ids[rows]
+                sent[ids[rows]] = True
+            if (sent[ids] & unsent & ~in_graph[ids]).any():
+                self._waiting.add(k)
         return concatenate(parts)
 
+    def _ever_sent(self, world: WorldMap) -> Mask:
+        """(N + 1,) whether a landmark was ever sent; the last entry is for id -1: False."""
+        size = len(world.landmarks) + 1
+        if self._sent is None:
+            self._sent = np.append(was_sent(world, world.keyframes.values()), False)
+        if (more := size - len(self._sent)) > 0:
+            self._sent = np.append(self._sent, np.zeros(more, bool))
+        return self._sent
 
-def was_sent(world: WorldMap) -> Mask:
-    """Mask (N,) of landmarks that were in the graph at some time, also marginalised ones."""
+
+def was_sent(world: WorldMap, keyframes: Iterable[Keyframe]) -> Mask:
+    """Mask (N,) of landmarks that one of the keyframes has sent to the graph, and still observes.
+
+    Marginalised landmarks are among them.
+    """
     sent = np.zeros(len(world.landmarks) + 1, bool)  # the last entry is for id -1
-    for keyframe in world.keyframes.values():
+    for keyframe in keyframes:
         sent[keyframe.sent_ids] = True
     return sent[:-1]
 
@@ -233,16 +281,20 @@ def read_back(world: WorldMap, estimate: GraphEstimate) -> None:
     landmarks.in_graph[inside] = True
     excluded = np.append(before & ~landmarks.in_graph, False)
     if excluded.any():  # their observations may be sent again later
-        for keyframe in world.keyframes.values():
+        for keyframe in world.observing(np.flatnonzero(excluded)):
             keyframe.sent_ids[excluded[keyframe.sent_ids]] = -1
-    known = np.array([i in world.keyframes for i in estimate.keyframe_ids], bool)
+            world.changed.add(keyframe.id)
+    keyframes = [world.keyframes.get(i) for i in estimate.keyframe_ids.tolist()]
+    present = [k for k in keyframes if k is not None]
+    known = np.array([k is not None for k in keyframes], bool)
     ids, T_new = estimate.keyframe_ids[known], estimate.poses_world_camera[known]
-    T_old = np.array([world.keyframes[i].T_world_camera for i in ids]).reshape(-1, 4, 4)
-    moved = np.abs(T_new - T_old).max(axis=(1, 2)) > 1e-9
+    T_old = np.array([k.T_world_camera for k in present]).reshape(-1, 4, 4)
+    change = np.abs(T_new - T_old).max(axis=(1, 2))
+    moved = change > 1e-9
     outside = np.flatnonzero(landmarks.in_map & ~landmarks.in_graph)
     if moved.any():
         landmarks.move_with_hosts(outside, ids[moved], T_old[moved], T_new[moved])
-    for i, T in zip(ids, T_new, strict=True):
-        world.keyframes[i].T_world_camera = T
+    for row in np.flatnonzero(change):
+        present[row].T_world_camera = T_new[row]
     position = np.searchsorted(estimate.landmark_ids, inside)
     landmarks.points_world[inside] = estimate.points_world[position]

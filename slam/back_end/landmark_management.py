@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 
@@ -15,9 +16,10 @@ from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.tracking.pose_optimisation import CHI2_2DOF, CHI2_3DOF, residuals
 from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.landmark_table import Patches
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.world_map import WorldMap
 
 
 @dataclass(frozen=True)
@@ -185,7 +187,9 @@ def loop_sides(
 def remove_redundant(world: WorldMap, history: FrameHistory, keyframe: Keyframe) -> Ints:
     """Remove a keyframe; its frames follow the one that shares most. The landmarks it observed."""
     _, ids = world.observed(keyframe)
-    parent = next(k for _, k in world.covisible(ids, 0) if k is not keyframe)
+    near = (k for _, k in world.covisible(ids, 1))
+    others = chain(near, reversed(world.keyframes.values()))
+    parent = next(k for k in others if k is not keyframe)
     T_parent_keyframe = inverse(parent.T_world_camera) @ keyframe.T_world_camera
     history.hand_over(keyframe.id, parent.id, T_parent_keyframe)
     world.remove_keyframe(keyframe, parent)

@@ -16,8 +16,9 @@ from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.results import Tracked
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_editor import MapEditor
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.world_map import WorldMap
 
 
 class MapBackend(MapEditor, Protocol):

@@ -44,8 +44,9 @@ from bmask_slam.tracking.results import Tracked
 from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.appearance import Patches
 from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_state import world_of, world_state
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 
@@ -268,9 +269,8 @@ class Mapper:
                 return removed
             removed |= refuted
             new = tuple((a, b, "loop") for a, b in sorted(refuted & fresh))
-            reason = "it does not fit the graph; waits until more agree"
             for a, b, _ in new:
-                self.events.loop_refused((a, b), reason)
+                self.events.loop_refused((a, b), "it does not fit the graph; waits for more")
             self.events.count({"loops pruned: refuted": len(new)})
             self.change_graph(remove_relative_poses=new)
             for ends in sorted(refuted - fresh):

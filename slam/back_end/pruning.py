@@ -18,8 +18,9 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
 from bmask_slam.graph.factors.graph_update import LOOP, GraphUpdate, RelativePoseName
 from bmask_slam.graph.smoother.smoother import Smoother
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.masked_keypoints import keypoints_under
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.world_map import WorldMap
 
 
 def _no_ids() -> Ints:

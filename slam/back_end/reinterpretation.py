@@ -14,7 +14,7 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Ints, no_ids
 from bmask_slam.graph.camera import Camera
 from bmask_slam.tracking.rolling_shutter import Motion, after_mean_row_s, at_one_moment, velocities
-from bmask_slam.world.world_map import Keyframe
+from bmask_slam.world.keyframe import Keyframe
 
 logger = logging.getLogger(__name__)
 

@@ -44,7 +44,8 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.tracking.rolling_shutter import share_of_rows, velocities
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 MAX_KEYFRAMES, MAX_OBSERVATIONS = 40, 8000
 """Those with most observations are used of more, and the landmarks that are seen most often."""

@@ -16,7 +16,8 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe, DepthSource
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 

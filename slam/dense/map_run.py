@@ -35,7 +35,8 @@ from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
 from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.tracking.results import FrameResult
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 

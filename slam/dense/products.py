@@ -36,7 +36,7 @@ from bmask_slam.mapping.surface.extraction import Surface
 from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.run_folder.semantic_files import OBJECTS, read_objects
 from bmask_slam.semantics.beliefs.surface_geometry import FLOORS, Ground, find_ground
-from bmask_slam.world.world_map import Keyframe
+from bmask_slam.world.keyframe import Keyframe
 
 PLAN_CELL_M, SAMPLE_STEP = 0.03, 20
 AMBIENT = 0.3

@@ -17,8 +17,9 @@ from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.sequences.right_images import RIGHT_LIST, RightImages, read_right_images
 from bmask_slam.sequences.sequence import Sequence, open_sequence
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_state import world_of
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.world_map import WorldMap
 
 
 @dataclass(frozen=True, eq=False)

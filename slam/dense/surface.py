@@ -40,7 +40,7 @@ from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.torch_threads import one_thread
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.results import TrackingStatus
-from bmask_slam.world.world_map import Keyframe
+from bmask_slam.world.keyframe import Keyframe
 
 logger = logging.getLogger(__name__)
 

@@ -10,8 +10,9 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_editor import MapReader
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.world_map import WorldMap
 
 _REACH = 0.02
 """Largest distance of a visible landmark from the depth image, as a share of its depth."""

@@ -36,8 +36,8 @@ from bmask_slam.semantics.objects.gravity import GravityEstimator
 from bmask_slam.semantics.objects.object_map import KeyframeView, ObjectMap, pixel_rays
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter, Segmenter
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_editor import MapReader
-from bmask_slam.world.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
 

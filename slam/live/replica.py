@@ -18,7 +18,8 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Arrays, Bits, Bytes, Ints, Mask
 from bmask_slam.graph.geometry import carried_along
 from bmask_slam.world.frame_history import FrameHistory
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 COLUMNS = (
     *("descriptors", "directions", "extent", "angles_rad", "patches", "patch_views"),
@@ -194,7 +195,7 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
     for keyframe in kept.values():
         keyframe.T_world_camera = poses[keyframe.id]
         keyframe.segment = segments[keyframe.id]
-    world.keyframes = kept | {k.id: k for k in pending}
+    world.set_keyframes(kept | {k.id: k for k in pending})
     world.next_keyframe_id = max(world.next_keyframe_id, delta.next_keyframe_id)
     history.take_back(kept)
     for keyframe_id, (parent, T_parent_culled) in delta.parents.items():
@@ -224,5 +225,7 @@ def _keyframe(keyframe_id: int, delta: WorldDelta, world: WorldMap) -> Keyframe:
         keyframe = Keyframe(*about, row.landmark_ids)
         world.store_features(keyframe)
     if row is not None:
-        keyframe.landmark_ids, keyframe.masked = row.landmark_ids, row.masked
+        rows = np.flatnonzero(keyframe.landmark_ids != row.landmark_ids)
+        world.observe(keyframe, rows, row.landmark_ids[rows])
+        keyframe.masked = row.masked
     return keyframe

@@ -40,7 +40,7 @@ from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult, Tracked
 from bmask_slam.world.frame_history import NO_KEYFRAME
-from bmask_slam.world.world_map import Keyframe
+from bmask_slam.world.keyframe import Keyframe
 
 if TYPE_CHECKING:  # it loads torch
     from bmask_slam.live.processes.remote_dense import RemoteDenseMapper

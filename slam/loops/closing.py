@@ -24,7 +24,8 @@ from bmask_slam.loops.noise import Cycles, LoopNoise, NoiseConfig
 from bmask_slam.loops.place_recognition import PlaceConfig, PlaceRecogniser
 from bmask_slam.loops.verification import LoopConfig, LoopConstraint, NoLoop, loop_view, verify_loop
 from bmask_slam.world.covisibility import CovisiblePaths
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 MEDIAN_CHI2_6DOF = 5.348
 

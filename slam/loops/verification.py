@@ -23,7 +23,8 @@ from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, make_pose, transform
 from bmask_slam.loops.relative_pose import LoopView, Views, refine_relative_pose
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 NEAREST_M = 0.1
 

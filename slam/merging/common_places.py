@@ -19,7 +19,8 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, so3_log, transform
 from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
 from bmask_slam.loops.verification import LoopConstraint, NoLoop, loop_view, verify_loop
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 Keyframes = Sequence[Keyframe]
 

@@ -28,8 +28,8 @@ from bmask_slam.semantics.tracks.instance_tracks import InstanceTracks
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.results import Tracked
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_editor import MapEditor
-from bmask_slam.world.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
 

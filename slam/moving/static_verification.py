@@ -20,9 +20,10 @@ from bmask_slam.moving.keyframe_masks import KeyframeMasks, Surface
 from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.semantics.tracks.instance_track import Track
 from bmask_slam.world.appearance import Patches
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.landmark_table import LandmarkTable
 from bmask_slam.world.masked_keypoints import keypoints_under
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.world_map import WorldMap
 
 
 @dataclass(frozen=True)

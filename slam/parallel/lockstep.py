@@ -28,7 +28,8 @@ from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.frame_history import FrameHistory
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from bmask_slam.graph.geometry import quaternion_from_rotation
 from bmask_slam.graph.sensors.imu import ImuConfig, readings_between
 from bmask_slam.graph.sensors.imu_mounting import ImuMounting, find_mounting
 from bmask_slam.graph.sensors.streams import SensorStreams
-from bmask_slam.world.world_map import Keyframe
+from bmask_slam.world.keyframe import Keyframe
 
 KNOWN_RAD, WELL_KNOWN_RAD = 0.005, 0.001
 """The IMU is used once the mounting's sigmas are below; below the second, they stay as they are."""

@@ -24,7 +24,8 @@ from bmask_slam.graph.inertial.tables import (
 from bmask_slam.graph.sensors.imu import ImuConfig, begin, readings_between
 from bmask_slam.graph.sensors.odometry import Motion
 from bmask_slam.graph.sensors.streams import SensorStreams
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 MIN_KEYFRAMES = 3
 """Gravity is not found from fewer."""

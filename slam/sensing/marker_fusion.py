@@ -45,7 +45,7 @@ from bmask_slam.sensing.marker_sightings import (
     spread,
 )
 from bmask_slam.sensing.reference_frame import SIGMA_M, SIGMA_RAD, Made, SensorChanges
-from bmask_slam.world.world_map import Keyframe
+from bmask_slam.world.keyframe import Keyframe
 
 PROBABILITY = 0.9999
 """Sightings that fit less well than all but this share do not fit."""

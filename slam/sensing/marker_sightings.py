@@ -23,7 +23,8 @@ from bmask_slam.graph.factors.graph_update import (
 from bmask_slam.graph.geometry import adjoint, inverse, so3_log
 from bmask_slam.graph.sensors.markers import MarkerPose
 from bmask_slam.sensing.reference_frame import Made
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 DIFFERENCE = 10.0
 """Of chi-square, between the two poses that a square may have, before one is believed."""

@@ -18,7 +18,7 @@ from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.sensors.mounting import T_of
 from bmask_slam.graph.sensors.planar import PlanarConfig, planar_factor
 from bmask_slam.sensing.reference_frame import Made, SensorChanges
-from bmask_slam.world.world_map import Keyframe
+from bmask_slam.world.keyframe import Keyframe
 
 PRIOR_SIGMAS = np.array([1.0, 1.0, 1e-3, 1e-2, 1e-2, 10.0])
 """Of the prior on the plane, rad and m: tilt and height are free, the rest says only where on the

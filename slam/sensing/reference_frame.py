@@ -42,7 +42,8 @@ from bmask_slam.graph.sensors.position import align, position_factor
 from bmask_slam.graph.sensors.streams import SensorStreams
 from bmask_slam.graph.trajectory import associate_stamps
 from bmask_slam.world.frame_history import FrameHistory
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 SIGMA_RAD, SIGMA_M = 1.0, 100.0
 """Of the prior on a reference frame, which holds what its measurements leave open."""

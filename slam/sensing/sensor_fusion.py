@@ -53,7 +53,8 @@ from bmask_slam.sensing.marker_sightings import WORDS, MarkerSight, Sighting, Ve
 from bmask_slam.sensing.planar_motion import planar_changes
 from bmask_slam.sensing.reference_frame import Made, ReferenceFrame, SensorChanges
 from bmask_slam.world.frame_history import FrameHistory
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 MIN_SHARED = 15
 """A new keyframe that shares fewer landmarks with the one before is held to it weakly ..."""
@@ -209,8 +210,7 @@ class SensorFusion:
         config = self.config.odometry
         robust = None if config.robust == "none" else config.robust
         for a, b in pairwise(keyframes):
-            name = (a.id, b.id, ODOMETRY)
-            if name in self._made:
+            if (name := (a.id, b.id, ODOMETRY)) in self._made:
                 continue
             motion = motion_between(self.streams, a.timestamp_s, b.timestamp_s, config)
             if motion is not None:

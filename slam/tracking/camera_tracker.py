@@ -15,9 +15,9 @@ from bmask_slam.tracking.relocalisation import RelocalisationConfig, is_within_r
 from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, more, reckoned, untracked
 from bmask_slam.tracking.rolling_shutter import PreviousPose
 from bmask_slam.tracking.tracker import Tracker
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
 from bmask_slam.world.map_editor import MapReader
-from bmask_slam.world.world_map import Keyframe
 
 MAX_AGO_S = 0.2  # the velocity for the rolling shutter is not taken from an older pose
 

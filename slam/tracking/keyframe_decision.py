@@ -9,8 +9,8 @@ from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.results import Tracked
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_editor import MapReader
-from bmask_slam.world.world_map import Keyframe
 
 CLOSE_BASELINES = 40
 """A point is close within so many baselines (ORB-SLAM2, section III.A)."""

@@ -16,9 +16,10 @@ from bmask_slam.tracking.motion_model import MotionModel
 from bmask_slam.tracking.results import Tracked, TrackingStatus
 from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.covisibility import CovisiblePaths
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
 from bmask_slam.world.map_editor import MapReader
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.world_map import WorldMap
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.files.array_file import check_ids, nested, part, split_rows
 from bmask_slam.graph.files.disk_arrays import concatenated
+from bmask_slam.world.keyframe import CulledKeyframe, Keyframe
 from bmask_slam.world.landmark_table import LandmarkTable
-from bmask_slam.world.world_map import CulledKeyframe, Keyframe, WorldMap
+from bmask_slam.world.world_map import WorldMap
 
 _Columns = dict[str, tuple[tuple[int, ...], type]]  # shape of a row, and its type
 _KEYFRAME: _Columns = {

@@ -9,83 +9,84 @@ import numpy as np
 
 from bmask_slam.features.brisk import Features
 from bmask_slam.features.patch_alignment import SubpixelConfig, cut_patches
-from bmask_slam.graph.arrays import Array, Ints, Mask
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.disk_arrays import DiskRecords
 from bmask_slam.graph.geometry import step_lengths, transform
+from bmask_slam.world.keyframe import CulledKeyframe, Keyframe
 from bmask_slam.world.landmark_table import LandmarkTable
+from bmask_slam.world.observers import Observers
 
 MAX_CULLED = 500
 _COLUMNS = [f.name for f in fields(Features) if f.name != "gray"]
 
 
 @dataclass
-class Keyframe:
-    """A frame that stays in the map.
-
-    Attributes:
-        id: position among all keyframes ever made, from 0.
-        frame_index, timestamp_s: of the frame it was.
-        segment: map segment it belongs to.
-        T_world_camera: (4, 4), replaced whenever the graph was optimised.
-        features: its keypoints.
-        landmark_ids: (N,) landmark of every keypoint, -1 for none.
-        sent_ids: (N,) the landmark for which a keypoint's observation was sent to the graph, or -1.
-        masked: (N,) keypoints on something that moves: they observe no landmark and make none.
-        revision: rises with each change of its observations or masks by ``WorldMap``.
-    """
-
-    id: int
-    frame_index: int
-    timestamp_s: float
-    segment: int
-    T_world_camera: Array
-    features: Features
-    landmark_ids: Ints
-    sent_ids: Ints = field(init=False)
-    masked: Mask = field(init=False)
-    revision: int = 0
-
-    def __post_init__(self) -> None:
-        self.sent_ids = np.full(len(self.landmark_ids), -1, np.int64)
-        self.masked = np.zeros(len(self.landmark_ids), bool)
-
-    @property
-    def free(self) -> Mask:
-        """Mask (N,) of the keypoints that observe no landmark and are not masked."""
-        return (self.landmark_ids < 0) & ~self.masked
-
-
-@dataclass(frozen=True)
-class CulledKeyframe:
-    """What late masks of a culled keyframe need: image_pixels (N, 2) and landmark_ids (N,)."""
-
-    image_pixels: Array
-    landmark_ids: Ints
-
-
-@dataclass
 class WorldMap:
     """Keyframes by id, in the order they were made, and the landmark table.
 
-    ``culled`` holds the keyframes that were culled last.
+    Observations change by methods of the map alone, since it keeps an index of them.
+
+    Attributes:
+        culled: the keyframes that were culled last.
+        changed: ids of keyframes whose observations changed; who sends them to the graph clears it.
     """
 
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
     landmarks: LandmarkTable = field(default_factory=LandmarkTable)
     next_keyframe_id: int = 0
     culled: dict[int, CulledKeyframe] = field(default_factory=dict)
+    changed: set[int] = field(default_factory=set, repr=False, compare=False)
+    _observers: Observers = field(default_factory=Observers, repr=False, compare=False)
     _disk: DiskRecords = field(default_factory=DiskRecords, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        for keyframe in self.keyframes.values():
+            self._index(keyframe)
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Add a keyframe; its id must be ``next_keyframe_id``."""
         self.keyframes[keyframe.id] = keyframe
         self.next_keyframe_id = keyframe.id + 1
+        self._index(keyframe)
+
+    def set_keyframes(self, keyframes: dict[int, Keyframe]) -> None:
+        """Replace all keyframes; those with an id that is there already are the same objects."""
+        for k in self.keyframes.keys() - keyframes.keys():
+            self._unindex(self.keyframes[k])
+        for k in sorted(keyframes.keys() - self.keyframes.keys()):
+            self._index(keyframes[k])
+        self.keyframes = keyframes
+
+    def observe(self, keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints | int) -> None:
+        """Record that keypoints (N,) of a keyframe observe landmarks (N,), -1 for none.
+
+        That is all: what the map knows of the landmarks stays, see ``attach`` and ``detach``.
+        """
+        before = keyframe.landmark_ids[keypoints]
+        self._observers.remove(keyframe.id, before[before >= 0])
+        keyframe.landmark_ids[keypoints] = landmark_ids
+        now = keyframe.landmark_ids[keypoints]
+        self._observers.add(keyframe.id, now[now >= 0])
+        keyframe.revision += 1
+        self.changed.add(keyframe.id)
+
+    def observing(self, landmark_ids: Ints) -> list[Keyframe]:
+        """The keyframes that observe any of these landmarks, oldest first."""
+        found = np.unique(self._observers.of(np.unique(landmark_ids)))
+        return [self.keyframes[k] for k in found.tolist()]
+
+    def _index(self, keyframe: Keyframe) -> None:
+        self._observers.add(keyframe.id, keyframe.landmark_ids[keyframe.landmark_ids >= 0])
+        self.changed.add(keyframe.id)
+
+    def _unindex(self, keyframe: Keyframe) -> None:
+        self._observers.remove(keyframe.id, keyframe.landmark_ids[keyframe.landmark_ids >= 0])
+        self.changed.discard(keyframe.id)
 
     def store_features(self, keyframe: Keyframe) -> None:
         """Move a keyframe's features to the disk, without their grey image."""
-        features = keyframe.features
-        arrays = self._disk.stored({name: getattr(features, name) for name in _COLUMNS})
+        arrays = self._disk.stored({name: getattr(keyframe.features, name) for name in _COLUMNS})
         keyframe.features = Features(**arrays, gray=np.zeros((0, 0), np.uint8))
 
     def release_memory(self) -> None:
@@ -143,8 +144,7 @@ class WorldMap:
         """
         usable = ~keyframe.masked[keypoints]
         keypoints, landmark_ids = keypoints[usable], landmark_ids[usable]
-        keyframe.landmark_ids[keypoints] = landmark_ids
-        keyframe.revision += 1
+        self.observe(keyframe, keypoints, landmark_ids)
         self.landmarks.observations[landmark_ids] += 1
         self._refresh(keyframe, keypoints, landmark_ids)
 
@@ -167,14 +167,14 @@ class WorldMap:
         Landmarks whose appearance was from here get it from the newest keyframe that is left.
         """
         landmarks, ids = self.landmarks, keyframe.landmark_ids[keypoints]
-        keyframe.revision += 1
-        keyframe.landmark_ids[keypoints] = keyframe.sent_ids[keypoints] = -1
+        self.observe(keyframe, keypoints, -1)
+        keyframe.sent_ids[keypoints] = -1
         ids = landmarks.remaining(ids)
         landmarks.observations[ids] -= 1
         stale = ids[landmarks.last_keyframe[ids] == keyframe.id]
         landmarks.last_keyframe[stale] = -1
         landmarks.patch_views[stale] = np.nan
-        for other in self.keyframes.values():
+        for other in self.observing(stale):
             rows = np.flatnonzero(np.isin(other.landmark_ids, stale))
             self._refresh(other, rows, other.landmark_ids[rows])
 
@@ -202,11 +202,11 @@ class WorldMap:
         """Remove landmarks, and mask the keypoints that observe them."""
         removed = np.zeros(len(self.landmarks) + 1, bool)  # the last entry is for id -1
         removed[landmark_ids] = True
-        for keyframe in self.keyframes.values():
-            rows = removed[keyframe.landmark_ids]
-            keyframe.revision += int(rows.any())
-            keyframe.masked |= rows
-            keyframe.landmark_ids[rows] = keyframe.sent_ids[rows] = -1
+        for keyframe in self.observing(landmark_ids):
+            rows = np.flatnonzero(removed[keyframe.landmark_ids])
+            keyframe.masked[rows] = True
+            self.observe(keyframe, rows, -1)
+            keyframe.sent_ids[rows] = -1
         self.landmarks.observations[landmark_ids] = 0
         self.landmarks.remove(landmark_ids)
 
@@ -228,6 +228,7 @@ class WorldMap:
         _, ids = self.observed(keyframe)
         self.landmarks.observations[ids] -= 1
         self.landmarks.host[self.landmarks.host == keyframe.id] = parent.id
+        self._unindex(keyframe)
         del self.keyframes[keyframe.id]
         pixels = keyframe.features.image_pixels
         self.culled[keyframe.id] = CulledKeyframe(pixels, keyframe.landmark_ids)
@@ -251,14 +252,15 @@ class WorldMap:
         landmarks.put_patches(ids[unlike], slots, patches, views[unlike])
 
     def covisible(self, landmark_ids: Ints, minimum: int) -> list[tuple[int, Keyframe]]:
-        """(shared landmarks, keyframe) of all that share at least a minimum, by falling number."""
-        observed = np.zeros(len(self.landmarks) + 1, bool)  # the last entry is for id -1
-        observed[landmark_ids] = True
-        shared = [
-            (int(np.count_nonzero(observed[k.landmark_ids])), k) for k in self.keyframes.values()
-        ]
-        strong = [pair for pair in shared if pair[0] >= minimum]
-        return sorted(strong, key=lambda pair: (-pair[0], -pair[1].id))
+        """(shared landmarks, keyframe) of all that share at least a minimum, by falling number.
+
+        The minimum is at least 1; of keyframes that share as many the newest comes first.
+        """
+        shared = np.bincount(self._observers.of(np.unique(landmark_ids)))
+        strong = np.flatnonzero(shared >= minimum)[::-1]
+        strong = strong[np.argsort(-shared[strong], kind="stable")]
+        counts = shared[strong].tolist()
+        return [(n, self.keyframes[k]) for n, k in zip(counts, strong.tolist(), strict=True)]
 
     def replace_landmarks(self, old_ids: Ints, new_ids: Ints) -> Ints:
         """Fuse duplicates: every observation of old_ids[k] becomes one of new_ids[k].
@@ -266,19 +268,13 @@ class WorldMap:
         Returns the ids that were removed. A keyframe that observes both keeps the new one's
         keypoint, since one landmark has one place in an image.
         """
-        remap = np.arange(len(self.landmarks) + 1)
-        remap[-1] = -1
-        remap[old_ids] = new_ids
-        while (remap[remap] != remap).any():  # follow chains of duplicates
-            remap = remap[remap]
-        new_ids = remap[old_ids]
+        old, new = _ends_of_chains(old_ids, new_ids)
+        new_ids = new[np.searchsorted(old, old_ids)]
         involved, present = np.zeros((2, len(self.landmarks) + 1), bool)
         involved[old_ids] = True
-        for keyframe in self.keyframes.values():
+        for keyframe in self.observing(old_ids):
             rows = np.flatnonzero(involved[keyframe.landmark_ids])
-            if len(rows) == 0:
-                continue
-            targets = remap[keyframe.landmark_ids[rows]]
+            targets = new[np.searchsorted(old, keyframe.landmark_ids[rows])]
             present[keyframe.landmark_ids] = True
             occupied = present[targets]
             present[keyframe.landmark_ids] = False
@@ -286,11 +282,19 @@ class WorldMap:
             repeated = np.ones(len(targets), bool)
             repeated[first] = False
             keep = ~(occupied | repeated)
-            keyframe.landmark_ids[rows[~keep]] = -1
-            keyframe.revision += 1
+            self.observe(keyframe, rows[~keep], -1)
             self.attach(keyframe, rows[keep], targets[keep])
         np.add.at(self.landmarks.found, new_ids, self.landmarks.found[old_ids])
         np.add.at(self.landmarks.visible, new_ids, self.landmarks.visible[old_ids])
         self.landmarks.replaced_by[old_ids] = new_ids
         self.landmarks.remove(old_ids)
         return old_ids
+
+
+def _ends_of_chains(old_ids: Ints, new_ids: Ints) -> tuple[Ints, Ints]:
+    """The duplicates (M,), ascending, and what each is in the end, also if that is a duplicate."""
+    old, last = np.unique(old_ids[::-1], return_index=True)
+    new = new_ids[::-1][last]
+    while len(again := np.flatnonzero(np.isin(new, old))):
+        new[again] = new[np.searchsorted(old, new[again])]
+    return old, new

@@ -15,7 +15,8 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 CAMERA = Camera(640, 480, fx=525.0, fy=520.0, cx=318.5, cy=241.5)
 HALF_CAMERA = Camera(320, 240, fx=262.5, fy=260.0, cx=159.25, cy=120.75, stereo_bf_px_m=15.0)

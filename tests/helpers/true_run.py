@@ -12,8 +12,9 @@ from bmask_slam.graph.files.array_file import nested
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.run_folder.map_file import write_map
 from bmask_slam.sequences.sequence import Sequence
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_state import world_state
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.world_map import WorldMap
 
 FRAMES = tuple(range(0, 40, 4))
 

@@ -35,8 +35,11 @@ from bmask_slam.world.appearance import PATCHES, Patches
 from bmask_slam.world.landmark_table import LandmarkTable
 
 FILE = Path("run/checkpoint")
-SCRATCH = {"elapsed_s", "stage_ms", "_disk", "_ahead", "_searcher", "revision"}
-"""Nothing between two frames; counts of changes in this process."""
+SCRATCH = {
+    *("elapsed_s", "stage_ms", "_disk", "_ahead", "_searcher", "revision"),
+    *("_observers", "changed", "_were_in_graph", "_sent", "_waiting"),
+}
+"""Nothing between two frames; counts of changes in this process; what is found anew in the map."""
 OPAQUE = ("cv2", "gtsam", "faiss")  # made anew from configuration or state
 PLAIN = {int, float, str, bool, type(None)}
 SETTINGS = [  # a keyframe nearly every frame, and most of them culled again

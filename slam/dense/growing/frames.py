@@ -12,7 +12,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.mapping.surface.parts import Region, SurfacePart
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.world.world_map import Keyframe
+from bmask_slam.world.keyframe import Keyframe
 
 EARLY = 0.9
 """A frame may come so early, as a share of the interval: stamps are not exact."""

@@ -18,7 +18,7 @@ from bmask_slam.live.processes.calibration_process import CalibrationSetup
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.worker import Failure, Worker
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.world.world_map import Keyframe
+from bmask_slam.world.keyframe import Keyframe
 
 logger = logging.getLogger(__name__)
 

@@ -44,7 +44,8 @@ from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import Tracked
 from bmask_slam.world.appearance import Patches
 from bmask_slam.world.frame_history import NO_KEYFRAME, Entries, FrameHistory
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 SAVE_EVERY, SAVE_SHARE = 20, 0.05  # a state is the whole map
 """Least interval of saved states in keyframes, and as a share of those of the map."""
@@ -120,7 +121,7 @@ class RemoteMapper:
         reference = self.reference
         keyframe = add_keyframe(self.world, frame, tracked, segment)
         self.world.store_features(keyframe)
-        keyframe.landmark_ids[tracked.keypoints] = tracked.landmark_ids
+        self.world.observe(keyframe, tracked.keypoints, tracked.landmark_ids)
         self.places.add(keyframe.id, keyframe.features.descriptors)
         self._pending.add(keyframe.id)
         self.send(
@@ -255,10 +256,9 @@ class RemoteMapper:
         """The message in place of one of which two processes died, if it needs one."""
         if not isinstance(message, NewKeyframe):
             return None
-        parent_id, T_parent_lost = _parent(message)
-        self.history.hand_over(message.id, parent_id, T_parent_lost)
-        parent = message.id, parent_id, T_parent_lost
-        return LostKeyframe(*parent, message.history, len(self.world.landmarks))
+        lost = message.id, *_parent(message)
+        self.history.hand_over(*lost)
+        return LostKeyframe(*lost, message.history, len(self.world.landmarks))
 
     def _apply(self, message: MapChanged) -> None:
         apply_delta(message.delta, self.world, self.history)

@@ -378,3 +378,73 @@ def test_no_window_keeps_every_landmark() -> None:
     world, _, smoother = windowed_world(FactorSelectionConfig())
     assert world.landmarks.in_graph.all()
     assert smoother.estimate().landmark_ids.tolist() == list(range(2 * COUNT))
+
+
+def unsent(world: WorldMap) -> set[tuple[int, int]]:
+    """(keyframe, landmark) of all observations that the graph was not told, by looking at all."""
+    return {
+        (k.id, int(k.landmark_ids[row]))
+        for k in world.keyframes.values()
+        for row in world.observed(k)[0]
+        if k.landmark_ids[row] != k.sent_ids[row]
+    }
+
+
+def change(world: WorldMap, selector: FactorSelector, rng: np.random.Generator) -> None:
+    """Something that happens to a map: keyframes gain or lose observations, landmarks go."""
+    keyframe = world.keyframes[int(rng.choice(list(world.keyframes)))]
+    rows, ids = world.observed(keyframe)
+    some = rng.permutation(len(rows))[:5]
+    match rng.integers(5):
+        case 0:
+            free = rng.permutation(np.flatnonzero(keyframe.free))[:8]
+            new = rng.permutation(np.setdiff1d(np.flatnonzero(world.landmarks.in_map), ids))
+            count = min(len(free), len(new))
+            world.attach(keyframe, free[:count], new[:count])
+        case 1:
+            world.detach(keyframe, rows[some])
+        case 2:
+            pair = np.sort(rng.choice(np.flatnonzero(world.landmarks.in_map), 2, replace=False))
+            selector.remove_landmarks(world.replace_landmarks(pair[1:], pair[:1]))
+        case 3:
+            world.landmarks.remove(ids[some[:1]])
+            selector.remove_landmarks(ids[some[:1]])
+        case 4:
+            world.mask_landmarks(ids[some[:1]])
+            selector.remove_landmarks(ids[some[:1]])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_updates_send_what_a_look_at_the_whole_map_would(seed: int) -> None:
+    """Landmarks are marginalised and come back; the graph refuses some of what it was sent."""
+    rng, (world, points) = np.random.default_rng(seed), make_world(1, 200)
+    world.detach(world.keyframes[0], np.arange(30, 200))
+    rules = FactorSelectionConfig(1000, 2, 60, 0, 2, 5, 5)
+    selector, returned = FactorSelector(rules), 0
+    selector.keyframe_update(world, world.keyframes[0])
+    for k in range(1, 60):
+        for _ in range(3):
+            change(world, selector, rng)
+        landmarks, before = world.landmarks, unsent(world)
+        if k % 3:
+            features = make_features(pose_of(k), points, random_descriptors(200, rng))
+            keyframe = add_keyframe(world, pose_of(k), features)
+            near = np.abs(np.arange(len(landmarks)) - 3 * k) < 30
+            seen = np.flatnonzero(landmarks.in_map & near & (rng.random(len(near)) < 0.5))
+            world.attach(keyframe, seen, seen)
+            before |= {(keyframe.id, i) for i in seen.tolist()}
+            update = selector.keyframe_update(world, keyframe)
+        else:
+            sent = {
+                i for o in world.keyframes.values() for i in o.sent_ids[o.sent_ids >= 0].tolist()
+            }
+            again = {i for _, i in before if i in sent and not landmarks.in_graph[i]}
+            update = selector.map_update(world)
+            assert set(update.landmark_ids.tolist()) == again
+            returned += len(again)
+        expected = {(keyframe_id, i) for keyframe_id, i in before if landmarks.in_graph[i]}
+        assert pairs(update) == expected
+        held = np.flatnonzero(landmarks.in_graph & landmarks.in_map)
+        refused = held[rng.random(len(held)) < 0.1]
+        read_back(world, estimate_of(world, np.setdiff1d(held, refused), np.eye(4)))
+    assert returned > 10, returned

@@ -23,8 +23,9 @@ from bmask_slam.back_end.landmark_management import (
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.world_map import WorldMap
 
 CONFIG = MappingConfig()
 TRACKER = Tracker(CAMERA, TrackingConfig())

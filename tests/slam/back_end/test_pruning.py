@@ -27,9 +27,10 @@ from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import TrackingStatus
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_state import world_of, world_state
 from bmask_slam.world.masked_keypoints import keypoints_under
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.world_map import WorldMap
 
 COUNT = 60
 

@@ -12,7 +12,7 @@ from bmask_slam.back_end.reinterpretation import KeyframeMotion, reinterpret
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.tracking.rolling_shutter import share_of_rows
-from bmask_slam.world.world_map import Keyframe
+from bmask_slam.world.keyframe import Keyframe
 
 TWIST = np.array([0.5, -0.6, 0.4, 0.3, 0.2, -0.3])
 READOUT_S = 0.025

@@ -43,7 +43,8 @@ from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.frame_history import FrameHistory
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 KEYFRAMES = 4
 POSES = {k: se3_exp(np.array([0, 0.01 * k, 0, 0.06 * k, 0, 0])) for k in range(KEYFRAMES)}

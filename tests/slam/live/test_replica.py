@@ -14,7 +14,8 @@ from bmask_slam.live.replica import COLUMNS, DeltaMaker, apply_delta, digest_row
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.frame_history import FrameHistory
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 SETTINGS = [  # a keyframe nearly every frame, and most of them culled again
     *("keyframes.min_interval_frames=1", "keyframes.max_shared=2.0"),

@@ -20,7 +20,8 @@ from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.tracking.results import untracked
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 STEP_RAD = np.deg2rad(10.0)
 ONCE_ROUND = 36

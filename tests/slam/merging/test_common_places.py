@@ -24,7 +24,8 @@ from bmask_slam.merging.common_places import (
     PlaceSearch,
     T_older_newer,
 )
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 HALF_TURN = se3_exp(np.array([0, np.pi, 0, 0, 0, 0.0]))
 WALLS = (np.eye(4), HALF_TURN)

@@ -17,7 +17,8 @@ from bmask_slam.semantics.beliefs.vote_config import VoteConfig
 from bmask_slam.semantics.instances.instances import Instance, certain
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.tracks.instance_track import Track
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 NAMES = label_set(("person",))
 WALL_M, BODY_M = 3.0, 2.0

@@ -23,8 +23,9 @@ from bmask_slam.tracking.relocalisation import (
 )
 from bmask_slam.tracking.results import Tracked
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.local_map import LocalMapConfig
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.world_map import WorldMap
 
 EXTRACTOR = BriskExtractor(CAMERA, FeatureConfig())
 TRACKER = Tracker(CAMERA, TrackingConfig())

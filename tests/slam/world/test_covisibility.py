@@ -8,7 +8,8 @@ from synthetic_view import add_keyframe, make_features
 
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.world.covisibility import MIN_SHARED, CovisiblePaths
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 COUNT = 12
 

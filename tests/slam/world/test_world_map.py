@@ -17,7 +17,8 @@ from bmask_slam.features.patch_alignment import PATCH_PX, SubpixelConfig, cut_pa
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.world.appearance import PATCHES
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 RNG = np.random.default_rng(12)
 COUNT = 30
