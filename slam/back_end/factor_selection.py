@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bmask_slam.features.brisk import Features, spread_order
-from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
+from bmask_slam.back_end.factors import anchor, observations_of, segment_prior
+from bmask_slam.features.brisk import spread_order
+from bmask_slam.graph.arrays import Arrays, Ints, Mask
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
-from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, PosePrior, concatenate
+from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, concatenate
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
@@ -39,12 +41,17 @@ class FactorSelectionConfig:
 class FactorSelector:
     """Turns changes of the map into updates of the graph and estimates back into the map.
 
-    ``depth_factor`` is the camera's ``graph_depth_factor``. An update looks only at keyframes of
-    which something changed: its cost does not grow with the map.
+    ``depth_factor`` is the camera's ``graph_depth_factor``, ``graph`` the graph's settings. An
+    update looks only at keyframes of which something changed: its cost does not grow with the map.
     """
 
-    def __init__(self, config: FactorSelectionConfig, depth_factor: float = 1.0):
-        self.config = config
+    def __init__(
+        self,
+        config: FactorSelectionConfig,
+        depth_factor: float = 1.0,
+        graph: SmootherConfig | None = None,
+    ):
+        self.config, self._graph = config, graph or SmootherConfig()
         self._depth_factor = depth_factor
         self._removed: list[Ints] = []
         self._removed_keyframes: list[int] = []
@@ -79,22 +86,31 @@ class FactorSelector:
         """Keyframes that observe marginalised landmarks more often than the graph was told."""
 
     def keyframe_update(self, world: WorldMap, keyframe: Keyframe) -> GraphUpdate:
-        """The update that adds one keyframe and its landmarks, with every other change."""
+        """The update that adds one keyframe and its landmarks, with every other change.
+
+        A keyframe with few landmarks in the graph, as behind a door or among people who were
+        masked, is also held weakly to the one before. Without that the graph would refuse it, and
+        then all that follow, since they share their landmarks with those that were refused.
+        """
         keypoints, ids = world.observed(keyframe)
         inside = world.landmarks.in_graph[ids]
         new_ids = self._promoted(world, keyframe, keypoints[~inside], ids[~inside], inside.sum())
         world.landmarks.in_graph[new_ids] = True
         marginalised = self._outside_window(world, ids)
         world.landmarks.in_graph[marginalised] = False
-        same = (k for k in world.keyframes.values() if k.segment == keyframe.segment)
-        begins = next(same) is keyframe
+        others = reversed(world.keyframes.values())
+        before = (k for k in others if k.segment == keyframe.segment and k is not keyframe)
+        last = next(before, None)
+        few = int(inside.sum()) + len(new_ids) < self._graph.min_left_observations
+        anchors = () if last is None or not few else (anchor(last, keyframe, self._graph),)
         return replace(
             self._changes(world),
             keyframe_ids=np.array([keyframe.id]),
             poses_world_camera=keyframe.T_world_camera[None],
             landmark_ids=new_ids,
             points_world=world.landmarks.points_world[new_ids],
-            priors=(segment_prior(keyframe),) if begins else (),
+            priors=(segment_prior(keyframe),) if last is None else (),
+            relative_poses=anchors,
             marginalise_landmarks=marginalised,
         )
 
@@ -227,46 +243,6 @@ def was_sent(world: WorldMap, keyframes: Iterable[Keyframe]) -> Mask:
     for keyframe in keyframes:
         sent[keyframe.sent_ids] = True
     return sent[:-1]
-
-
-def sent_observations(world: WorldMap, depth_factor: float) -> Observations:
-    """Every observation that was sent to the graph, as the keyframes' features have it now."""
-    parts = []
-    for keyframe in world.keyframes.values():
-        rows = np.flatnonzero(
-            (keyframe.sent_ids >= 0) & (keyframe.sent_ids == keyframe.landmark_ids)
-        )
-        parts.append(observations_of(keyframe, rows, keyframe.sent_ids[rows], depth_factor))
-    return concatenate(parts)
-
-
-def segment_prior(keyframe: Keyframe) -> PosePrior:
-    """The first keyframe of a segment fixes the segment's frame."""
-    return PosePrior(keyframe.id, keyframe.T_world_camera, np.eye(6) * 1e-8)
-
-
-def observations_of(
-    keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints, depth_factor: float = 1.0
-) -> Observations:
-    """The graph's observations of some keypoints of a keyframe."""
-    features = keyframe.features
-    return Observations(
-        keyframe_ids=np.full(len(keypoints), keyframe.id),
-        landmark_ids=landmark_ids,
-        measurements=stereo_measurements(features, keypoints),
-        sigmas_px=quantised(features.sigmas_px[keypoints] * [1.0, 1.0, depth_factor]),
-    )
-
-
-def quantised(sigmas_px: Array) -> Array:
-    """Sigmas rounded to powers of 2^(1/3), so that factors can share noise models."""
-    return np.exp2(np.round(3 * np.log2(sigmas_px)) / 3)
-
-
-def stereo_measurements(features: Features, keypoints: Ints) -> Array:
-    """(N, 3) of u_left, v, u_right = u_left - disparity; u_right NaN without depth."""
-    pixels = features.pixels[keypoints]
-    return np.column_stack([pixels, pixels[:, 0] - features.disparity_px[keypoints]])
 
 
 def read_back(world: WorldMap, estimate: GraphEstimate) -> None:

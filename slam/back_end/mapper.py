@@ -70,9 +70,9 @@ class Mapper:
         self.loops = LoopCloser(camera, config.loops, self.events)
         self.sensors = SensorFusion(config.sensors, self.events)
         self.update_ms: list[float] = []
-        self._tracker = tracker
-        self._mapping, self._graph_config = config.mapping, config.graph
-        self._factor_selector = FactorSelector(config.factor_selection, camera.graph_depth_factor)
+        self._tracker, self._mapping, self._graph_config = tracker, config.mapping, config.graph
+        selection = config.factor_selection, camera.graph_depth_factor, config.graph
+        self._factor_selector = FactorSelector(*selection)
 
     @property
     def places(self) -> DescriptorIndex:

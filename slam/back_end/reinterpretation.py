@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bmask_slam.back_end.factor_selection import read_back, sent_observations
+from bmask_slam.back_end.factor_selection import read_back
+from bmask_slam.back_end.factors import sent_observations
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Ints, no_ids

@@ -7,10 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from bmask_slam.back_end.factors import anchor
 from bmask_slam.back_end.map_backend import MapBackend
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.factors.graph_update import ANCHOR, RelativePose
-from bmask_slam.graph.factors.observability import diagonal_covariance
+from bmask_slam.graph.factors.graph_update import RelativePose
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.tracking.relocalisation import RelocalisationConfig
@@ -92,17 +92,10 @@ def anchors(world: WorldMap, config: SmootherConfig) -> tuple[RelativePose, ...]
     """Weak poses between each keyframe and the next of its segment, for a graph that is built anew.
 
     Where segments have few landmarks in common, or a keyframe was anchored before, landmarks alone
-    would not connect all keyframes, and the graph would refuse some. The smoother releases the
-    anchors that it does not need.
+    would not connect all keyframes, and the graph would refuse some.
     """
-    keyframes = world.keyframes.values()
-    covariance = diagonal_covariance(
-        config.anchor_sigma_rotation_rad, config.anchor_sigma_translation_m
-    )
     return tuple(
-        RelativePose(
-            a.id, b.id, inverse(a.T_world_camera) @ b.T_world_camera, covariance, kind=ANCHOR
-        )
-        for segment in sorted({keyframe.segment for keyframe in keyframes})
+        anchor(a, b, config)
+        for segment in sorted({keyframe.segment for keyframe in world.keyframes.values()})
         for a, b in pairwise(world.in_segment(segment))
     )

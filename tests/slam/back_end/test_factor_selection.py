@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, add_keyframe, make_features, points_before, random_descriptors
 
-from bmask_slam.back_end.factor_selection import (
-    FactorSelectionConfig,
-    FactorSelector,
-    observations_of,
-    quantised,
-    read_back,
-    stereo_measurements,
-)
+from bmask_slam.back_end.factor_selection import FactorSelectionConfig, FactorSelector, read_back
+from bmask_slam.back_end.factors import observations_of, quantised, stereo_measurements
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import DepthNoise
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
-from bmask_slam.graph.factors.graph_update import GraphUpdate
+from bmask_slam.graph.factors.graph_update import ANCHOR, GraphUpdate
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.world.world_map import WorldMap
@@ -291,6 +285,30 @@ def test_the_smoother_corrects_disturbed_poses(whole: bool) -> None:
     for k, keyframe in world.keyframes.items():
         assert np.abs(se3_log(inverse(pose_of(k)) @ keyframe.T_world_camera)).max() < 1e-4
     np.testing.assert_allclose(world.landmarks.points_world, points, atol=1e-3)
+
+
+def test_a_keyframe_that_shares_next_to_nothing_is_held_and_the_graph_goes_on() -> None:
+    """Behind a door all is new: it and those that follow are in the graph; a loop frees it."""
+    world, points = make_world(0)
+    selector, smoother = FactorSelector(EVERYTHING), Smoother(CAMERA)
+    shown = np.zeros((9, COUNT), bool)
+    shown[:4, :30], shown[4:, 27:], shown[8] = True, True, True  # 3 in common, less than 6
+    ids = np.full(COUNT, -1)
+    for k in range(9):
+        rows = np.flatnonzero(shown[k])
+        features = make_features(pose_of(k), points, random_descriptors(COUNT, RNG))
+        keyframe = add_keyframe(world, pose_of(k), features)
+        new = rows[ids[rows] < 0]
+        world.attach(keyframe, np.setdiff1d(rows, new), ids[np.setdiff1d(rows, new)])
+        ids[new] = world.make_landmarks(keyframe, new, points[new])
+        estimate = smoother.update(selector.keyframe_update(world, keyframe))
+        read_back(world, estimate)
+        assert len(estimate.refused) == 0
+        assert estimate.keyframe_ids.tolist() == list(range(k + 1))
+        anchored = [(p.keyframe_a, p.keyframe_b) for p in smoother.relative_poses(ANCHOR)]
+        assert anchored == ([(3, 4)] if 4 <= k < 8 else [])
+    for k, keyframe in world.keyframes.items():
+        assert np.abs(se3_log(inverse(pose_of(k)) @ keyframe.T_world_camera)).max() < 1e-3
 
 
 def windowed_world(config: FactorSelectionConfig) -> tuple[WorldMap, FactorSelector, Smoother]:
