@@ -16,6 +16,7 @@ from repository import ROOT
 
 from benchmarks.pages import table, written_sections
 from benchmarks.paths import RESULTS
+from benchmarks.scale import day
 from benchmarks.section_report import REPORTS
 from benchmarks.semantics.real_rooms import ROOMS, score_objects
 from benchmarks.semantics.room_truth import centre_in, moved
@@ -52,6 +53,21 @@ def test_a_script_runs_as_its_description_says() -> None:
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("10 landmarks,")
+
+
+def test_minutes_of_a_simulated_robot_stay_true(tmp_path: Path, monkeypatch, capsys) -> None:
+    given = ["--hours", "0.03", "--storeys", "1", "--keypoints", "120", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["day", *given])
+    day.main()
+    heads, *rows, events = capsys.readouterr().out.splitlines()
+    assert len(rows) == 4
+    last = dict(zip(heads.split(), map(float, rows[-1].split()), strict=True))
+    assert 20 < last["keyframes"] <= 75
+    assert last["ate_mm"] < 50
+    assert last["wrong"] == 0
+    assert "refused: keyframe" not in events
+    assert (tmp_path / "day.png").stat().st_size > 10_000
+    assert len(json.loads((tmp_path / "day.json").read_text())) == 4
 
 
 @pytest.mark.parametrize("report", REPORTS.values(), ids=REPORTS)

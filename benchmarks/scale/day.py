@@ -1,6 +1,6 @@
 """A day of a robot, by descriptors and poses alone: what grows with the map, and how fast.
 
-    python -m benchmarks.scale.day [--hours 8] [--storeys 10] [--keypoints 250] [--out DIR]
+    python -m benchmarks.scale.day [--hours 8] [--storeys 10] [--keypoints 250] [--picture FILE]
 
 A robot walks through the storeys of a simulated building in random order, round by round, one
 keyframe every 1.44 s. No image is rendered: landmarks on the walls have descriptors of random bits,
@@ -296,6 +296,7 @@ def main() -> None:
     parser.add_argument("--keypoints", type=int, default=250)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
+    parser.add_argument("--picture", type=Path, help="default: day.png beside the numbers")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     building = Building(args.storeys, args.per_m2, np.random.default_rng(args.seed))
@@ -314,7 +315,7 @@ def main() -> None:
     kinds = Counter(event.kind.name for event in day.mapper.events.take())
     print("events:", ", ".join(f"{name} {count}" for name, count in sorted(kinds.items())))
     (args.out / "day.json").write_text(json.dumps([asdict(h) for h in hours], indent=1))
-    plot(hours, np.array(day.times_ms), args.out / "day.png")
+    plot(hours, np.array(day.times_ms), args.picture or args.out / "day.png")
 
 
 if __name__ == "__main__":

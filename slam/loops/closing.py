@@ -13,7 +13,7 @@ import numpy as np
 
 from bmask_slam.events import EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex, IndexConfig
-from bmask_slam.graph.arrays import Arrays, Ints, Mask
+from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import chi2_quantile, mahalanobis
 from bmask_slam.graph.factors.graph_estimate import RelativePoseErrors
@@ -240,12 +240,17 @@ class LoopCloser:
         """Whether the drift that a loop implies is possible on the shortest way between its ends.
 
         Rooms that look alike give loops that agree with each other; only the way between them, over
-        which the map cannot have drifted so far, tells them apart.
+        which the map cannot have drifted so far, tells them apart. Most imply so little drift that
+        they would fit without any way.
         """
         a, b = (world.keyframes[k].T_world_camera for k in loop.ends)
-        S = self.noise.covariance(loop) + self.noise.possible_drift(paths.between(*loop.ends))
         r = se3_log(inverse(loop.T_a_b) @ inverse(a) @ b)
-        fits = bool(mahalanobis(r[None], S[None])[0] < self.config.gate)
+
+        def fits_after(way: Array) -> bool:
+            S = self.noise.covariance(loop) + self.noise.possible_drift(way)
+            return bool(mahalanobis(r[None], S[None])[0] < self.config.gate)
+
+        fits = fits_after(np.zeros(3)) or fits_after(paths.between(*loop.ends))
         if not fits:
             reason = f"{loop.inliers} inliers, but it implies more drift than is possible"
             self._events.loop_refused(loop.ends, reason)
