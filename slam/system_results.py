@@ -38,6 +38,7 @@ NEWER_ARRAYS = (
     "mapper.events.",
     "mapper.history.information",
     "mapper.loops.noise.",
+    "mapper.loops.drift.",
     "localiser.images.",
     "semantics.surfaces.",
 )

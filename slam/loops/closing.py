@@ -20,6 +20,7 @@ from bmask_slam.graph.factors.graph_estimate import RelativePoseErrors
 from bmask_slam.graph.factors.graph_update import RelativePose
 from bmask_slam.graph.files.array_file import nested, part, split_rows
 from bmask_slam.graph.geometry import inverse, se3_log
+from bmask_slam.loops.drift import MapDrift
 from bmask_slam.loops.noise import Cycles, LoopNoise, NoiseConfig
 from bmask_slam.loops.place_recognition import PlaceConfig, PlaceRecogniser
 from bmask_slam.loops.verification import LoopConfig, LoopConstraint, NoLoop, loop_view, verify_loop
@@ -72,7 +73,7 @@ class LoopCloser:
         self.config = config
         self.index = DescriptorIndex(config.index)
         self.recogniser = PlaceRecogniser(self.index, config.places)
-        self.noise = LoopNoise(config.noise)
+        self.noise, self.drift = LoopNoise(config.noise), MapDrift(config.noise)
         self.waiting: list[LoopConstraint] = []
         self.closed: dict[tuple[int, int], bool] = {}
         """Ends of the closed loops, and whether each is trusted more than the graph."""
@@ -93,7 +94,11 @@ class LoopCloser:
                 [np.zeros((0, 2), np.int64), *(loop.landmark_pairs for loop in waiting)]
             ),
             "pairs": np.array([len(loop.landmark_pairs) for loop in waiting], np.int64),
-            **nested(recogniser=self.recogniser.state(), noise=self.noise.state()),
+            **nested(
+                recogniser=self.recogniser.state(),
+                noise=self.noise.state(),
+                drift=self.drift.state(),
+            ),
         }
 
     def restore(self, state: Arrays, world: WorldMap) -> None:
@@ -101,6 +106,7 @@ class LoopCloser:
         self.index.restore({k.id: k.features.descriptors for k in world.keyframes.values()})
         self.recogniser.restore(part(state, "recogniser"))
         self.noise.restore(part(state, "noise"))
+        self.drift.restore(part(state, "drift"))
         ends_closed = map(tuple, state["closed"].tolist())
         self.closed = dict(zip(ends_closed, state["believed"].tolist(), strict=True))
         columns = (
@@ -183,6 +189,7 @@ class LoopCloser:
         if len({loop.keyframe_b for loop in confirmed}) < 2:
             confirmed = []
         self.noise.learn(confirmed, world)
+        self._learn_drift(confirmed, world, paths)
         entering = {loop.ends for loop in confirmed}
         self.waiting = [loop for loop in loops if loop.ends not in entering]
         for loop in found:
@@ -243,18 +250,24 @@ class LoopCloser:
         which the map cannot have drifted so far, tells them apart. Most imply so little drift that
         they would fit without any way.
         """
-        a, b = (world.keyframes[k].T_world_camera for k in loop.ends)
-        r = se3_log(inverse(loop.T_a_b) @ inverse(a) @ b)
+        implied = _implied_drift(loop, world)
 
         def fits_after(way: Array) -> bool:
-            S = self.noise.covariance(loop) + self.noise.possible_drift(way)
-            return bool(mahalanobis(r[None], S[None])[0] < self.config.gate)
+            S = self.noise.covariance(loop) + self.drift.covariance(way)
+            return bool(mahalanobis(implied[None], S[None])[0] < self.config.gate)
 
         fits = fits_after(np.zeros(3)) or fits_after(paths.between(*loop.ends))
         if not fits:
             reason = f"{loop.inliers} inliers, but it implies more drift than is possible"
             self._events.loop_refused(loop.ends, reason)
         return fits
+
+    def _learn_drift(
+        self, confirmed: list[LoopConstraint], world: WorldMap, paths: CovisiblePaths
+    ) -> None:
+        implied = [_implied_drift(loop, world) for loop in confirmed]
+        covariances = [self.noise.covariance(loop) for loop in confirmed]
+        self.drift.learn(implied, covariances, [paths.between(*k.ends) for k in confirmed])
 
     def _agreement(self, loops: list[LoopConstraint], world: WorldMap) -> Mask:
         """(N, N) whether loops agree; False where their paths are too long to compare."""
@@ -264,6 +277,12 @@ class LoopCloser:
         agree = np.zeros((len(loops), len(loops)), bool)
         agree[cycles.first, cycles.second] = comparable & (chi2 < self.config.gate)
         return agree | agree.T
+
+
+def _implied_drift(loop: LoopConstraint, world: WorldMap) -> Array:
+    """The tangent (6,) by which the map's relative pose differs from a loop's."""
+    a, b = (world.keyframes[k].T_world_camera for k in loop.ends)
+    return se3_log(inverse(loop.T_a_b) @ inverse(a) @ b)
 
 
 def _largest_clique(agree: Mask) -> Ints:

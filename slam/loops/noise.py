@@ -1,4 +1,4 @@
-"""How uncertain loops and the map are: cycles of loops, the real noise of loops, possible drift."""
+"""How uncertain loops and the map are: cycles of loops, and the real noise of loops."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.world.world_map import WorldMap
 
 DIMENSIONS = 6
-ROOT_FROM_M = 4.0
-"""On longer ways the drift grows with the root of the length, as a sum of independent errors."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,9 @@ class NoiseConfig:
     The map's relative pose is trusted within ``drift_rad_per_m`` and ``drift_m_per_m`` of its
     path. Errors of the camera model (a wrong focal length, rows exposed in turn) grow with turns:
     ``model_share`` of the angle turned on the way, and as many metres, since points are some metres
-    away. Without any path the sigmas are ``model_sigma_rad`` and ``model_sigma_m``.
+    away. Without any path the sigmas are ``model_sigma_rad`` and ``model_sigma_m``. How far the map
+    can have drifted over long ways is learned from loops (`loops.drift`), with the weight of
+    ``prior_closings`` and the factor ``drift_margin`` on the covariance.
     """
 
     prior_ratio: float = 4.0
@@ -40,6 +40,8 @@ class NoiseConfig:
     model_sigma_rad: float = 0.003
     model_sigma_m: float = 0.005
     model_share: float = 0.02
+    prior_closings: float = 1.0
+    drift_margin: float = 2.0
 
 
 @dataclass(frozen=True)
@@ -137,20 +139,7 @@ class LoopNoise:
         change = np.linalg.norm(se3_log(T_a_b).reshape(-1, 2, 3), axis=2)
         rules = self.config
         floor = np.array([rules.model_sigma_rad, rules.model_sigma_m])
-        return _diagonal(floor + rules.model_share * change)
-
-    def possible_drift(self, way: Array) -> Array:
-        """Covariance (6, 6) of the map's relative pose over a way (3,), see ``CovisiblePaths``.
-
-        What ``map_covariances`` states for a short path. On a long way independent errors add up as
-        squares, and an error of rotation displaces the end as far as the way leads away.
-        """
-        rules, (turn_rad, length_m, away_m) = self.config, way
-        bent, drift_rad = rules.model_share * turn_rad, rules.drift_rad_per_m * _growth(length_m)
-        sigma_rad = np.hypot(rules.model_sigma_rad + bent, drift_rad)
-        drift_m = np.hypot(rules.drift_m_per_m * _growth(length_m), drift_rad / 2 * away_m)
-        sigma_m = np.hypot(rules.model_sigma_m + bent, drift_m)
-        return _diagonal(np.array([sigma_rad, sigma_m]))
+        return diagonal_covariances(floor + rules.model_share * change)
 
     def map_covariances(self, paths: Array) -> Array:
         """Covariances (..., 6, 6) of the map's relative pose over paths (..., 2) in rad and metres.
@@ -161,14 +150,9 @@ class LoopNoise:
         bent, drift_rad = rules.model_share * turns_rad, rules.drift_rad_per_m * lengths_m
         sigmas_rad = rules.model_sigma_rad + drift_rad + bent
         sigmas_m = rules.model_sigma_m + (rules.drift_m_per_m + drift_rad / 2) * lengths_m + bent
-        return _diagonal(np.stack([sigmas_rad, sigmas_m], axis=-1))
+        return diagonal_covariances(np.stack([sigmas_rad, sigmas_m], axis=-1))
 
 
-def _growth(lengths_m: Array) -> Array:
-    """Metres (...) that count for the drift of ways of so many metres."""
-    return np.minimum(lengths_m, np.sqrt(ROOT_FROM_M * lengths_m))
-
-
-def _diagonal(sigmas: Array) -> Array:
+def diagonal_covariances(sigmas: Array) -> Array:
     """Covariances (..., 6, 6) of sigmas (..., 2), one for the rotations, one for translations."""
     return np.repeat(sigmas**2, 3, axis=-1)[..., None] * np.eye(DIMENSIONS)

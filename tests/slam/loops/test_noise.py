@@ -13,6 +13,7 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.checks import chi2_quantile
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
+from bmask_slam.loops.drift import MapDrift
 from bmask_slam.loops.noise import LoopNoise, NoiseConfig
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.world.covisibility import CovisiblePaths
@@ -151,8 +152,34 @@ def test_what_a_bent_map_adds_grows_with_the_change_and_has_units() -> None:
 def test_drift_grows_with_the_root_of_a_long_way(
     way: tuple[float, ...], sigma_rad: float, sigma_m: float
 ) -> None:
-    sigmas = np.sqrt(np.diagonal(LoopNoise(NoiseConfig()).possible_drift(np.array(way))))
+    sigmas = np.sqrt(np.diagonal(MapDrift(NoiseConfig()).covariance(np.array(way))))
     np.testing.assert_allclose(sigmas, np.repeat([sigma_rad, sigma_m], 3))
+
+
+def test_drift_is_less_where_loops_have_shown_less_and_never_more_than_assumed() -> None:
+    """Loops after 20 m of way: their implied drift is 1 % of what was possible, then all of it."""
+    drift, way = MapDrift(NoiseConfig()), np.array([10.0, 20.0, 5.0])
+    assumed = drift.covariance(way)
+    sigmas, rng = np.sqrt(np.diagonal(assumed)), np.random.default_rng(5)
+    own, far = 1e-6 * np.eye(6), np.full(3, np.inf)
+    for _ in range(20):
+        drift.learn(0.1 * sigmas * rng.normal(size=(3, 6)), [own] * 3, [way] * 3)
+    # (1 + 20 * 0.01) / 21, times 2
+    np.testing.assert_allclose(drift.scale, 0.114, rtol=0.1)
+    ratio = np.diagonal(drift.covariance(way)) / np.diagonal(assumed)
+    assert (ratio < 0.13).all()
+    before = drift.scale
+    drift.learn(sigmas[None], [assumed], [way])  # no more precise than the drift
+    drift.learn(sigmas[None], [own], [far])
+    assert drift.scale == before
+    again = MapDrift(NoiseConfig())
+    again.restore(drift.state())
+    assert again.scale == before
+    for _ in range(40):
+        drift.learn(2 * sigmas * rng.normal(size=(3, 6)), [own] * 3, [way] * 3)
+    assert drift.scale == 1.0
+    again.restore(MapDrift(NoiseConfig()).state())
+    np.testing.assert_array_equal(again.covariance(way), assumed)
 
 
 def test_a_room_that_looks_like_another_is_no_loop() -> None:
