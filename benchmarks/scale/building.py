@@ -6,18 +6,20 @@ The building is rendered once (20 000 frames of 640x480 take hours and 16 GB of 
 smaller ones are a thinner version of the same walk) and run with `--segmenter none`, loops closed
 and not. A closed loop is wrong if its keyframes were further apart than ``APART_M`` in truth: rooms
 that look alike are 3.2 m and more apart. Times are of this machine; what counts is that they stay.
+The next day, the first ``NEXT_DAY_FRAMES`` frames go on with the map of the first (`--continue`).
 """
 
 from __future__ import annotations
 
 import argparse
+import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from benchmarks.suite.recorded_run import RecordingSystem
+from benchmarks.suite.recorded_run import RecordingSystem, recorded
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.trajectory import associate_stamps, read_tum
@@ -26,7 +28,7 @@ from bmask_slam.rendering.sequence import RenderConfig, render_sequence
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.system_config import SystemConfig
 
-PARTS = 10
+PARTS, NEXT_DAY_FRAMES = 10, 300
 APART_M = 2.5
 COLUMNS = (
     *("frames", "path_m", "keyframes", "landmarks", "in_graph", "factors"),
@@ -43,18 +45,11 @@ def sequence_of(work: Path, fps: float, width: int) -> Path:
     return folder
 
 
-def recorded(sequence: Path, out: Path, closed: bool) -> RecordingSystem:
+def run_of(sequence: Path, out: Path, closed: bool) -> RecordingSystem:
     """The system of a run by default options but for the segmenter and perhaps loops."""
     settings = ("semantics.segmenter.name=none", f"loops.enabled={str(closed).lower()}")
-    systems: list[RecordingSystem] = []
-
-    def make_system(*given: Any) -> RecordingSystem:
-        systems[:] = [RecordingSystem(*given)]  # a run may begin anew
-        return systems[0]
-
     config = resolve(SystemConfig, None, settings)
-    run(RunOptions(sequence, config, out=out, overwrite=True, quiet=True), make_system)
-    return systems[0]
+    return recorded(RunOptions(sequence, config, out=out, overwrite=True, quiet=True))
 
 
 def table(out: Path, rows: list[dict[str, float]], walked_m: Array) -> str:
@@ -90,6 +85,23 @@ def loops_apart_m(system: RecordingSystem, out: Path, sequence: Path) -> Array:
     return np.array([float(np.linalg.norm(place[a] - place[b])) for a, b in ends])
 
 
+def next_day(sequence: Path, before: Path) -> str:
+    """What became of the begin of the walk in the map of a run, as text."""
+    out, begin_s = before.with_name(f"{before.name}-next-day"), time.perf_counter()
+    settings = ("semantics.segmenter.name=none",)
+    config = resolve(SystemConfig, None, settings)
+    options = RunOptions(sequence, config, out=out, overwrite=True, quiet=True, map=before)
+    run(replace(options, max_frames=NEXT_DAY_FRAMES))
+    passed_s = time.perf_counter() - begin_s
+    frames, metrics = Run(out).frames, Run(out).metrics
+    located = int(np.argmax(frames.segment == 0))
+    return (
+        f"the next day: in the old map from frame {located} on, {NEXT_DAY_FRAMES} frames in "
+        f"{passed_s:.0f} s with the map's reading and writing, "
+        f"ATE {1e3 * metrics['ate_rmse'].value:.0f} mm"
+    )
+
+
 def main() -> None:
     """Render, run with and without loops, print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -104,7 +116,7 @@ def main() -> None:
     print(f"{len(positions)} frames, {walked_m[-1]:.0f} m")
     for closed in (True, False):
         out = sequence.with_name(f"{sequence.name}-{'closed' if closed else 'open'}")
-        system = recorded(sequence, out, closed)
+        system = run_of(sequence, out, closed)
         metrics = Run(out).metrics
         ate_m = metrics["ate_rmse"].value
         apart_m = loops_apart_m(system, out, sequence)
@@ -118,6 +130,8 @@ def main() -> None:
             f"run folder {size_mb:.0f} MB",
             flush=True,
         )
+        if closed:
+            print(next_day(sequence, out), flush=True)
 
 
 if __name__ == "__main__":

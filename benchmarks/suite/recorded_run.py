@@ -56,23 +56,29 @@ def resident_mb() -> float:
     return int(status.read_text(encoding="ascii").split()[1]) * 4096 / 1e6
 
 
+def recorded(options: RunOptions) -> RecordingSystem:
+    """The system of a run; the last one, if the run begins anew with the camera that it found."""
+    systems: list[RecordingSystem] = []
+
+    def make_system(*given: Any) -> RecordingSystem:
+        systems.append(RecordingSystem(*given))
+        return systems[-1]
+
+    run(options, make_system)
+    return systems[-1]
+
+
 def main() -> None:
     """Parse, run, write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("sequence", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
-    systems: list[RecordingSystem] = []
-
-    def make_system(*given: Any) -> RecordingSystem:
-        systems.append(RecordingSystem(*given))
-        return systems[0]
-
-    run(RunOptions(arguments.sequence, out=arguments.out, overwrite=True, quiet=True), make_system)
+    system = recorded(RunOptions(arguments.sequence, out=arguments.out, overwrite=True, quiet=True))
     with (arguments.out / "growth.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(systems[0].rows)
+        writer.writerows(system.rows)
 
 
 if __name__ == "__main__":
