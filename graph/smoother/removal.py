@@ -24,6 +24,9 @@ from bmask_slam.graph.smoother.anchoring import (
     rows_in_front,
 )
 
+HOPS = 3
+"""Relative poses from keyframes that lose something to those through which they may be linked."""
+
 
 @dataclass(frozen=True)
 class Removal:
@@ -134,7 +137,8 @@ def _still_linked(
     """Whether the keyframes that share what is removed stay firmly linked: a fast local test.
 
     Then none has become loose: the first of them on the way from a prior is linked to others, with
-    which it shares as much as before, and the rest are linked to it. No prior may be removed.
+    which it shares as much as before, and the rest are linked to it. No prior may be removed. The
+    links may lead over keyframes around them, up to ``HOPS`` relative poses away.
     """
     table, factors = tables.observations, tables.pose_factors
     if any(factors[number].is_prior for number in numbers):
@@ -153,16 +157,21 @@ def _still_linked(
     touched, group = touched[left], group[left]
     if not len(touched):  # partial factors alone
         return True
-    near = np.unique(touched)
-    edges = set(tables.numbers_of_keyframes(near.tolist())) - set(numbers)
-    part = firm_components(
-        near,
-        table.select(table.rows_left(near, rows)),
-        [factors[number].link for number in sorted(edges)],
-        config.min_left_observations,
-    )[np.searchsorted(near, touched)]
     group = np.unique(group, return_inverse=True)[1]
-    return group.max() + 1 == len(np.unique(group * len(near) + part))
+    near = np.unique(touched)
+    for _ in range(HOPS + 1):
+        edges = set(tables.numbers_of_keyframes(near.tolist())) - set(numbers)
+        links = [factors[number].link for number in sorted(edges)]
+        observed = table.select(table.rows_left(near, rows))
+        part = firm_components(near, observed, links, config.min_left_observations)
+        parts = part[np.searchsorted(near, touched)]
+        if group.max() + 1 == len(np.unique(group * len(near) + parts)):
+            return True
+        wider = np.union1d(near, ids_array(k for link in links for k in link))
+        if len(wider) == len(near):
+            return False
+        near = wider
+    return False
 
 
 def _remove_from_tables(plan: _Plan, tables: FactorTables) -> list[int]:

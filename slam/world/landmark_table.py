@@ -197,10 +197,10 @@ class LandmarkTable:
 
     def move_with_hosts(self, ids: Ints, keyframe_ids: Ints, T_old: Array, T_new: Array) -> None:
         """Carry landmarks along with their host keyframes from poses T_old to T_new (K, 4, 4)."""
-        position = np.searchsorted(keyframe_ids, self.host[ids])
-        position = np.minimum(position, len(keyframe_ids) - 1)
-        known = keyframe_ids[position] == self.host[ids]
-        ids, position = ids[known], position[known]
+        row_of = np.full(max(self.host.max(initial=-1), keyframe_ids.max()) + 2, -1)
+        row_of[keyframe_ids] = np.arange(len(keyframe_ids))
+        position = row_of[self.host[ids]]  # -1, also for a host of -1, if it does not move
+        ids, position = ids[position >= 0], position[position >= 0]
         T_move = (T_new @ inverse(T_old))[position]
         self.points_world[ids] = transform(T_move, self.points_world[ids][:, None])[:, 0]
 
