@@ -79,6 +79,19 @@ REPORTS = {
             "graph.covariances --runs 200 --sequence {sequences}/living_room",
         ),
     }),
+    "scale": Report(RESULTS / "scale.md", "Results: a building, a day, and beyond", {
+        "building": (
+            "Three storeys of rooms that look alike", "scale.building --work {sequences}/building"
+        ),
+        "reading": ("What the building shows", ""),
+        "day": (
+            "A day of a robot, by descriptors and poses",
+            "scale.day --picture docs/images/day.png",
+        ),
+        "far": ("At 100 km, on paper", ""),
+    }, pictures={
+        "day": {"day.png": "Times, memory and file, keyframes and loops over the day"},
+    }),
     "live": Report(RESULTS / "live.md", "Results: the live loop", {
         "speed": ("Red kitchen, offline and live", "live.speed --repeats 1"),
         "session": (

@@ -39,6 +39,7 @@ NEWER_ARRAYS = (
     "mapper.history.information",
     "mapper.loops.noise.",
     "mapper.loops.drift.",
+    "mapper.loops.recogniser.dismissed",
     "localiser.images.",
     "semantics.surfaces.",
 )

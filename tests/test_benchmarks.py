@@ -59,7 +59,8 @@ def test_minutes_of_a_simulated_robot_stay_true(tmp_path: Path, monkeypatch, cap
     given = ["--hours", "0.03", "--storeys", "1", "--keypoints", "120", "--out", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", ["day", *given])
     day.main()
-    heads, *rows, events = capsys.readouterr().out.splitlines()
+    heads, *rows, events, optimised = capsys.readouterr().out.splitlines()
+    assert optimised.startswith("last optimisation")
     assert len(rows) == 4
     last = dict(zip(heads.split(), map(float, rows[-1].split()), strict=True))
     assert 20 < last["keyframes"] <= 75

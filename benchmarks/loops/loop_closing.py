@@ -25,6 +25,7 @@ from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
+from bmask_slam.world.covisibility import CovisiblePaths
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
@@ -43,9 +44,9 @@ class WrongLoops:
         closer.propose, closer.confirm = self.propose, self.confirm  # type: ignore[method-assign]
 
     def propose(
-        self, keyframe: Keyframe, world: WorldMap, elsewhere: bool = False
+        self, keyframe: Keyframe, world: WorldMap, paths: CovisiblePaths | None = None
     ) -> list[LoopConstraint]:
-        right = self._propose(keyframe, world, elsewhere)
+        right = self._propose(keyframe, world, paths)
         old = [k for k in world.keyframes if k < keyframe.id - 10]
         noise = np.repeat([TURN_RAD, SHIFT_M], 3)
         self._wrong = [
@@ -60,8 +61,10 @@ class WrongLoops:
         self.count += len(self._wrong)
         return right if self.let_in else [*right, *self._wrong]
 
-    def confirm(self, proposed: list[LoopConstraint], world: WorldMap) -> list[LoopConstraint]:
-        confirmed = self._confirm(proposed, world)
+    def confirm(
+        self, proposed: list[LoopConstraint], world: WorldMap, paths: CovisiblePaths | None = None
+    ) -> list[LoopConstraint]:
+        confirmed = self._confirm(proposed, world, paths)
         return [*confirmed, *self._wrong] if self.let_in else confirmed
 
 
@@ -71,8 +74,10 @@ def state_before_loops(system: SlamSystem, sequence: Sequence) -> tuple[Arrays, 
     closer = system.mapper.loops
     propose = closer.propose
 
-    def spy(keyframe: Keyframe, world: WorldMap, elsewhere: bool = False) -> list[LoopConstraint]:
-        proposed.extend(propose(keyframe, world, elsewhere))
+    def spy(
+        keyframe: Keyframe, world: WorldMap, paths: CovisiblePaths | None = None
+    ) -> list[LoopConstraint]:
+        proposed.extend(propose(keyframe, world, paths))
         return proposed
 
     closer.propose = spy  # type: ignore[method-assign]

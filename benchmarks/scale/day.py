@@ -25,7 +25,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.graph.building import CAMERA, landmarks, visible, walk
-from benchmarks.graph.pose_graphs import aligned_errors_m
+from benchmarks.graph.pose_graphs import position_rmse_m
 from benchmarks.suite.recorded_run import resident_mb
 from bmask_slam.back_end.config import BackEndConfig
 from bmask_slam.back_end.mapper import Mapper
@@ -213,12 +213,15 @@ class Day:
         ]
         return len(loops), int(np.count_nonzero(np.array(off_m) > WRONG_M))
 
+    def ate_mm(self) -> float:
+        """RMSE of the positions of the keyframes in the map, after alignment."""
+        ids = np.fromiter(self.mapper.world.keyframes, np.int64)
+        poses = np.array([k.T_world_camera for k in self.mapper.world.keyframes.values()])
+        return 1e3 * position_rmse_m(poses, self.poses[ids])
+
     def hour(self, since: int, out: Path) -> Hour:
         """What there is now, and what the keyframes made after the first ``since`` took."""
         mapper, count = self.mapper, len(self.times_ms)
-        ids = np.fromiter(mapper.world.keyframes, np.int64)
-        poses = np.array([k.T_world_camera for k in mapper.world.keyframes.values()])
-        errors_m = aligned_errors_m(poses, self.poses[ids])
         times = np.array(self.times_ms[since:])
         median, p95 = np.median(times, axis=0), np.percentile(times, 95, axis=0)
         steps_m = np.linalg.norm(np.diff(self.poses[:count, :3, 3], axis=0), axis=1)
@@ -227,14 +230,14 @@ class Day:
         return Hour(
             hour=count * PERIOD_S / 3600,
             path_km=float(steps_m.sum()) / 1e3,
-            keyframes=len(ids),
+            keyframes=len(mapper.world.keyframes),
             landmarks=int(mapper.world.landmarks.in_map.sum()),
             ids=len(mapper.world.landmarks),
             in_graph=len(estimate.landmark_ids),
             factors=estimate.factors,
             loops=loops,
             wrong=wrong,
-            ate_mm=1e3 * float(np.sqrt(np.mean(np.sum(errors_m**2, axis=1)))),
+            ate_mm=self.ate_mm(),
             insert_ms=float(median[0]),
             graph_ms=float(median[1]),
             graph_p95_ms=float(p95[1]),
@@ -314,6 +317,10 @@ def main() -> None:
             print(table(hours[-1:]).split("\n")[-1] if len(hours) > 1 else table(hours), flush=True)
     kinds = Counter(event.kind.name for event in day.mapper.events.take())
     print("events:", ", ".join(f"{name} {count}" for name, count in sorted(kinds.items())))
+    begin_s = time.process_time()
+    day.mapper.finish()
+    passed_s = time.process_time() - begin_s
+    print(f"last optimisation, of all landmarks: {passed_s:.0f} s, ATE {day.ate_mm():.1f} mm")
     (args.out / "day.json").write_text(json.dumps([asdict(h) for h in hours], indent=1))
     plot(hours, np.array(day.times_ms), args.picture or args.out / "day.png")
 

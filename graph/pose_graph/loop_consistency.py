@@ -113,3 +113,17 @@ def cycle_chi2(
     S = S + carry_c @ map_covariances[0] @ np.swapaxes(carry_c, -1, -2)
     S = S + carry_d @ covariances[second] @ np.swapaxes(carry_d, -1, -2)
     return mahalanobis(se3_log(E), S)
+
+
+def largest_clique(agree: Mask) -> Ints:
+    """Indices of a large set of loops that all agree (N, N), found greedily from each member."""
+    best: list[int] = []
+    order = np.argsort(-agree.sum(axis=1), kind="stable").tolist()
+    for start in order:
+        clique = [start]
+        for k in order:
+            if agree[k, clique].all():
+                clique.append(k)
+        if len(clique) > len(best):
+            best = clique
+    return np.sort(np.array(best, np.int64))

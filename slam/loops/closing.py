@@ -13,13 +13,14 @@ import numpy as np
 
 from bmask_slam.events import EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex, IndexConfig
-from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
+from bmask_slam.graph.arrays import Array, Arrays, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import chi2_quantile, mahalanobis
 from bmask_slam.graph.factors.graph_estimate import RelativePoseErrors
 from bmask_slam.graph.factors.graph_update import RelativePose
 from bmask_slam.graph.files.array_file import nested, part, split_rows
 from bmask_slam.graph.geometry import inverse, se3_log
+from bmask_slam.graph.pose_graph.loop_consistency import largest_clique
 from bmask_slam.loops.drift import MapDrift
 from bmask_slam.loops.noise import Cycles, LoopNoise, NoiseConfig
 from bmask_slam.loops.place_recognition import PlaceConfig, PlaceRecogniser
@@ -140,12 +141,16 @@ class LoopCloser:
         """Loops from a new keyframe that are confirmed now, and those that they confirm."""
         if not self.config.enabled:
             return []
-        return self.confirm(self.propose(keyframe, world), world)
+        paths = CovisiblePaths(world)
+        return self.confirm(self.propose(keyframe, world, paths), world, paths)
 
     def propose(
-        self, keyframe: Keyframe, world: WorldMap, elsewhere: bool = False
+        self, keyframe: Keyframe, world: WorldMap, paths: CovisiblePaths | None = None
     ) -> list[LoopConstraint]:
-        """Verified loops between a keyframe and older ones; ``elsewhere``: of other segments."""
+        """Verified loops between a keyframe and older ones that the drift on these paths allows.
+
+        Without paths: those to other segments, to which there is none.
+        """
 
         def covisible(keyframe_id: int) -> list[int]:
             _, ids = world.observed(world.keyframes[keyframe_id])
@@ -163,7 +168,7 @@ class LoopCloser:
             others = others[: self.config.neighbours]
             for other in (candidate.keyframe_id, *others):
                 here = world.keyframes[other].segment == keyframe.segment
-                if other in tried or here is elsewhere:
+                if other in tried or here is (paths is None):
                     break
                 tried.add(other)
                 old = loop_view(world.keyframes[other], world)
@@ -171,15 +176,20 @@ class LoopCloser:
                 if isinstance(result, NoLoop):
                     self._events.loop_refused((other, keyframe.id), result)
                     break
+                if paths and not self._within_drift(result, world, paths):
+                    self.recogniser.dismiss(other, keyframe.id)
+                    break
                 found.append(result)
         return found
 
-    def confirm(self, proposed: list[LoopConstraint], world: WorldMap) -> list[LoopConstraint]:
+    def confirm(
+        self, proposed: list[LoopConstraint], world: WorldMap, paths: CovisiblePaths | None = None
+    ) -> list[LoopConstraint]:
         """The largest set of loops that agree, if it is large enough; the others wait.
 
         All members are returned: loops that waited, and those that confirm them.
         """
-        paths = CovisiblePaths(world)
+        paths = paths or CovisiblePaths(world)
         loops = [loop for loop in proposed if self._within_drift(loop, world, paths)]
         if not loops:
             return []
@@ -199,7 +209,7 @@ class LoopCloser:
 
     def agreeing(self, loops: list[LoopConstraint], world: WorldMap) -> list[LoopConstraint]:
         """The largest set of loops that agree with each other over the map's paths."""
-        return [loops[k] for k in _largest_clique(self._agreement(loops, world))]
+        return [loops[k] for k in largest_clique(self._agreement(loops, world))]
 
     def contradicts(
         self, loop: LoopConstraint, others: list[LoopConstraint], world: WorldMap
@@ -252,15 +262,17 @@ class LoopCloser:
         """
         implied = _implied_drift(loop, world)
 
-        def fits_after(way: Array) -> bool:
+        def chi2_after(way: Array) -> float:
             S = self.noise.covariance(loop) + self.drift.covariance(way)
-            return bool(mahalanobis(implied[None], S[None])[0] < self.config.gate)
+            return float(mahalanobis(implied[None], S[None])[0])
 
-        fits = fits_after(np.zeros(3)) or fits_after(paths.between(*loop.ends))
-        if not fits:
-            reason = f"{loop.inliers} inliers, but it implies more drift than is possible"
-            self._events.loop_refused(loop.ends, reason)
-        return fits
+        gate = self.config.gate
+        if chi2_after(np.zeros(3)) < gate or (chi2 := chi2_after(paths.between(*loop.ends))) < gate:
+            return True
+        reason = f"{loop.inliers} inliers, but it implies more drift than is possible"
+        self._events.loop_refused(loop.ends, reason)
+        self.drift.places_look_alike |= chi2 > self.config.noise.alike_excess * gate
+        return False
 
     def _learn_drift(
         self, confirmed: list[LoopConstraint], world: WorldMap, paths: CovisiblePaths
@@ -283,17 +295,3 @@ def _implied_drift(loop: LoopConstraint, world: WorldMap) -> Array:
     """The tangent (6,) by which the map's relative pose differs from a loop's."""
     a, b = (world.keyframes[k].T_world_camera for k in loop.ends)
     return se3_log(inverse(loop.T_a_b) @ inverse(a) @ b)
-
-
-def _largest_clique(agree: Mask) -> Ints:
-    """Indices of a large set of loops that all agree, found greedily from each member."""
-    best: list[int] = []
-    order = np.argsort(-agree.sum(axis=1), kind="stable").tolist()
-    for start in order:
-        clique = [start]
-        for k in order:
-            if agree[k, clique].all():
-                clique.append(k)
-        if len(clique) > len(best):
-            best = clique
-    return np.sort(np.array(best, np.int64))

@@ -21,12 +21,19 @@ class MapDrift:
     Before any loop was closed the map may drift as ``NoiseConfig`` states, which allows for a bad
     camera. Each set of loops that is confirmed shows how far it did drift: the mean square of what
     they imply, over what was possible, scales the covariance from then on, with the weight of
-    ``prior_closings`` closings that found all of it, and with a margin. So the rooms of another
-    storey, to which the way is long, are told apart once some loops are closed.
+    ``prior_closings`` closings that found all of it, and with a margin.
+
+    A map in which places look alike, as the rooms of an office do, is held to ``alike_share`` of
+    the drift: there a wrong loop is likelier than a map that has drifted far. That they do is known
+    by a verified loop which is far from possible: by ``alike_excess`` times the chi-square allowed.
+
+    Attributes:
+        places_look_alike: whether such a loop was found.
     """
 
     def __init__(self, config: NoiseConfig) -> None:
         self.config = config
+        self.places_look_alike = False
         self._sum, self._closings = 0.0, 0
 
     @property
@@ -34,16 +41,17 @@ class MapDrift:
         """Factor of the covariances, at most 1."""
         rules = self.config
         ratio = (rules.prior_closings + self._sum) / (rules.prior_closings + self._closings)
-        return min(rules.drift_margin * ratio, 1.0)
+        alike = rules.alike_share**2 if self.places_look_alike else 1.0
+        return alike * min(rules.drift_margin * ratio, 1.0)
 
     def state(self) -> Arrays:
         """What was learned."""
-        return {"learned": np.array([self._sum, self._closings], float)}
+        return {"learned": np.array([self._sum, self._closings, self.places_look_alike], float)}
 
     def restore(self, state: Arrays) -> None:
         """Go on from a state."""
-        learned_sum, closings = state["learned"].tolist()
-        self._sum, self._closings = learned_sum, int(closings)
+        learned_sum, closings, alike = state["learned"].tolist()
+        self._sum, self._closings, self.places_look_alike = learned_sum, int(closings), bool(alike)
 
     def covariance(self, way: Array) -> Array:
         """Covariance (6, 6) of the map's relative pose over a way (3,), see ``CovisiblePaths``."""

@@ -29,7 +29,8 @@ class NoiseConfig:
     ``model_share`` of the angle turned on the way, and as many metres, since points are some metres
     away. Without any path the sigmas are ``model_sigma_rad`` and ``model_sigma_m``. How far the map
     can have drifted over long ways is learned from loops (`loops.drift`), with the weight of
-    ``prior_closings`` and the factor ``drift_margin`` on the covariance.
+    ``prior_closings`` and the factor ``drift_margin`` on the covariance; where places look alike,
+    by a loop with ``alike_excess`` times the chi-square allowed, it is ``alike_share`` of that.
     """
 
     prior_ratio: float = 4.0
@@ -42,6 +43,8 @@ class NoiseConfig:
     model_share: float = 0.02
     prior_closings: float = 1.0
     drift_margin: float = 2.0
+    alike_excess: float = 9.0
+    alike_share: float = 0.3
 
 
 @dataclass(frozen=True)

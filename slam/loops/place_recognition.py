@@ -25,7 +25,8 @@ class PlaceConfig:
 
     The ``recent`` last keyframes and those covisible with the query are no candidates. A keyframe
     needs ``min_votes``; a group needs ``group_share`` of the best group's votes, and must have
-    been found by ``consistent_queries`` queries in a row. At most ``candidates`` are returned.
+    been found by ``consistent_queries`` queries in a row. At most ``candidates`` are returned. A
+    place that was dismissed is none for ``patience`` keyframes.
     """
 
     recent: int = 10
@@ -33,6 +34,7 @@ class PlaceConfig:
     group_share: float = 0.6
     consistent_queries: int = 2
     candidates: int = 3
+    patience: int = 10
 
 
 @dataclass(frozen=True)
@@ -58,14 +60,16 @@ class PlaceRecogniser:
         self.index = index
         self.config = config or PlaceConfig()
         self._previous: list[tuple[frozenset[int], int]] = []
+        self._dismissed: dict[int, int] = {}  # keyframe of the place, and the last that was there
 
     def state(self) -> Arrays:
-        """The groups that the last query found."""
+        """The groups that the last query found, and what was dismissed."""
         groups = [sorted(group) for group, _ in self._previous]
         return {
             "members": np.array([k for group in groups for k in group], np.int64),
             "sizes": np.array([len(group) for group in groups], np.int64),
             "queries": np.array([queries for _, queries in self._previous], np.int64),
+            "dismissed": np.array(list(self._dismissed.items()), np.int64).reshape(-1, 2),
         }
 
     def restore(self, state: Arrays) -> None:
@@ -75,6 +79,14 @@ class PlaceRecogniser:
             (frozenset(group.tolist()), queries)
             for group, queries in zip(groups, state["queries"].tolist(), strict=True)
         ]
+        self._dismissed = dict(state["dismissed"].tolist())
+
+    def dismiss(self, place: int, keyframe_id: int) -> None:
+        """A keyframe looks like a place, that of another one, but cannot be there.
+
+        Nor can those that follow, which look like it too.
+        """
+        self._dismissed[place] = keyframe_id
 
     def query(
         self, keyframe_id: int, descriptors: Bits, covisible: Neighbours
@@ -83,6 +95,8 @@ class PlaceRecogniser:
 
         ``covisible`` gives the ids of the keyframes that share landmarks with one.
         """
+        since = keyframe_id - self.config.patience
+        self._dismissed = {k: last for k, last in self._dismissed.items() if last >= since}
         votes = self.index.votes(descriptors, self.excluded(keyframe_id, covisible))
         groups = self._groups(votes, covisible)
         found = [
@@ -114,7 +128,8 @@ class PlaceRecogniser:
             members = frozenset({best, *covisible(best)})
             total = sum(counts.get(member, 0.0) for member in sorted(members - used))
             used |= members
-            groups.append((members, best, own, total))
+            if members.isdisjoint(self._dismissed):
+                groups.append((members, best, own, total))
         groups.sort(key=lambda group: (-group[3], group[1]))
         limit = self.config.group_share * groups[0][3] if groups else 0.0
         return [group for group in groups if group[3] >= limit]

@@ -131,7 +131,7 @@ class PlaceSearch:
             closer.add(keyframe)
         found: dict[tuple[int, int], list[LoopConstraint]] = {}
         for keyframe in newer:
-            for loop in closer.propose(keyframe, self.world, elsewhere=True):
+            for loop in closer.propose(keyframe, self.world):
                 a, b = (self.world.keyframes[k].segment for k in loop.ends)
                 found.setdefault((a, b), []).append(loop)
         self.reasons = log.reasons

@@ -114,6 +114,7 @@ def system() -> SlamSystem:
         PendingMovable(2, second, 0.5, np.full((3, 3), 0.5), (removed[1],), 1, 3),
     ]
     loops.closed = {(first, second): True, (first, second + 1): False}
+    loops.recogniser.dismiss(first, second)
     loops.recogniser._previous = [(frozenset({first, second}), 1), (frozenset({second}), 2)]
     return system
 

@@ -169,6 +169,12 @@ def test_drift_is_less_where_loops_have_shown_less_and_never_more_than_assumed()
     ratio = np.diagonal(drift.covariance(way)) / np.diagonal(assumed)
     assert (ratio < 0.13).all()
     before = drift.scale
+    drift.places_look_alike = True
+    np.testing.assert_allclose(drift.scale, before * 0.3**2)
+    known = MapDrift(NoiseConfig())
+    known.restore(drift.state())
+    assert known.places_look_alike
+    drift.places_look_alike = False
     drift.learn(sigmas[None], [assumed], [way])  # no more precise than the drift
     drift.learn(sigmas[None], [own], [far])
     assert drift.scale == before
@@ -183,7 +189,10 @@ def test_drift_is_less_where_loops_have_shown_less_and_never_more_than_assumed()
 
 
 def test_a_room_that_looks_like_another_is_no_loop() -> None:
-    """6 m beside where the camera is, after a walk of 26 m and 13 rad between the two."""
+    """6 m beside where the camera is, after a walk of 26 m and 13 rad between the two.
+
+    What lies far beyond the gate shows that places look alike; then less drift is allowed.
+    """
     world = WorldMap()
     nothing = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
     for k in range(27):
@@ -194,7 +203,9 @@ def test_a_room_that_looks_like_another_is_no_loop() -> None:
     closer = LoopCloser(CAMERA, LoopClosingConfig(), EventLog())
     a, b = (world.keyframes[k].T_world_camera for k in (0, 26))
     paths, loop = CovisiblePaths(world), noisy_loops(turning_world(0.01), 1.0, 1)[0]
-    for apart_m, fits in ((0.5, True), (6.15, False)):
+    tried = ((1.0, True), (3.0, False), (1.0, True), (20.0, False), (1.0, False), (0.3, True))
+    for k, (apart_m, fits) in enumerate(tried):
+        assert closer.drift.places_look_alike == (k > 3)
         T_a_b = inverse(a) @ se3_exp([0, 0, 0, 0, 0, apart_m]) @ b
         found = replace(loop, keyframe_a=0, keyframe_b=26, T_a_b=T_a_b)
         assert closer._within_drift(found, world, paths) == fits

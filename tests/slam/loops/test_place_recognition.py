@@ -205,3 +205,24 @@ def test_covisible_keyframes_vote_together(rng: np.random.Generator) -> None:
     (candidate,) = recogniser.query(9, place, neighbours(visits))
     assert candidate.keyframe_id in (1, 2, 3)
     assert candidate.group_votes > 1.5 * candidate.votes
+
+
+def test_a_dismissed_place_makes_room_for_another_until_it_is_tried_again(
+    rng: np.random.Generator,
+) -> None:
+    """Three visits to places that look alike; the first is the likest, and a keyframe of it too."""
+    place, visits = random_descriptors(120, rng), {0: 0, 1: 0, 2: 1, 3: 2}
+    rules = PlaceConfig(recent=0, consistent_queries=1, candidates=1, patience=5)
+    recogniser = PlaceRecogniser(DescriptorIndex(), rules)
+    for k, seen in enumerate((place, place[:100], place[:90], place[:80])):
+        recogniser.index.add(k, changed(seen, 10 + k, rng))
+
+    def best(keyframe_id: int) -> list[int]:
+        return [c.keyframe_id for c in recogniser.query(keyframe_id, place, neighbours(visits))]
+
+    assert best(20) == [0]
+    recogniser.dismiss(1, 20)  # of the same visit
+    again = PlaceRecogniser(recogniser.index, rules)
+    again.restore(recogniser.state())
+    recogniser = again
+    assert [best(k) for k in (21, 25, 26)] == [[2], [2], [0]]
