@@ -44,7 +44,7 @@ class NoiseConfig:
     prior_closings: float = 1.0
     drift_margin: float = 2.0
     alike_excess: float = 9.0
-    alike_share: float = 0.3
+    alike_share: float = 0.2
 
 
 @dataclass(frozen=True)
