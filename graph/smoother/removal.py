@@ -157,8 +157,7 @@ def _still_linked(
     touched, group = touched[left], group[left]
     if not len(touched):  # partial factors alone
         return True
-    group = np.unique(group, return_inverse=True)[1]
-    near = np.unique(touched)
+    near, group = np.unique(touched), np.unique(group, return_inverse=True)[1]
     for _ in range(HOPS + 1):
         edges = set(tables.numbers_of_keyframes(near.tolist())) - set(numbers)
         links = [factors[number].link for number in sorted(edges)]
