@@ -45,11 +45,11 @@ def sequence_of(work: Path, fps: float, width: int) -> Path:
     return folder
 
 
-def run_of(sequence: Path, out: Path, closed: bool) -> RecordingSystem:
-    """The system of a run by default options but for the segmenter and perhaps loops."""
+def options_of(sequence: Path, out: Path, closed: bool = True) -> RunOptions:
+    """The default options of a run but for the segmenter and perhaps loops."""
     settings = ("semantics.segmenter.name=none", f"loops.enabled={str(closed).lower()}")
     config = resolve(SystemConfig, None, settings)
-    return recorded(RunOptions(sequence, config, out=out, overwrite=True, quiet=True))
+    return RunOptions(sequence, config, out=out, overwrite=True, quiet=True)
 
 
 def table(out: Path, rows: list[dict[str, float]], walked_m: Array) -> str:
@@ -88,10 +88,7 @@ def loops_apart_m(system: RecordingSystem, out: Path, sequence: Path) -> Array:
 def next_day(sequence: Path, before: Path) -> str:
     """What became of the begin of the walk in the map of a run, as text."""
     out, begin_s = before.with_name(f"{before.name}-next-day"), time.perf_counter()
-    settings = ("semantics.segmenter.name=none",)
-    config = resolve(SystemConfig, None, settings)
-    options = RunOptions(sequence, config, out=out, overwrite=True, quiet=True, map=before)
-    run(replace(options, max_frames=NEXT_DAY_FRAMES))
+    run(replace(options_of(sequence, out), map=before, max_frames=NEXT_DAY_FRAMES))
     passed_s = time.perf_counter() - begin_s
     frames, metrics = Run(out).frames, Run(out).metrics
     located = int(np.argmax(frames.segment == 0))
@@ -116,7 +113,7 @@ def main() -> None:
     print(f"{len(positions)} frames, {walked_m[-1]:.0f} m")
     for closed in (True, False):
         out = sequence.with_name(f"{sequence.name}-{'closed' if closed else 'open'}")
-        system = run_of(sequence, out, closed)
+        system = recorded(options_of(sequence, out, closed))
         metrics = Run(out).metrics
         ate_m = metrics["ate_rmse"].value
         apart_m = loops_apart_m(system, out, sequence)

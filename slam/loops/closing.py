@@ -19,9 +19,8 @@ from bmask_slam.graph.factors.checks import chi2_quantile, mahalanobis
 from bmask_slam.graph.factors.graph_estimate import RelativePoseErrors
 from bmask_slam.graph.factors.graph_update import RelativePose
 from bmask_slam.graph.files.array_file import nested, part, split_rows
-from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.graph.pose_graph.loop_consistency import largest_clique
-from bmask_slam.loops.drift import MapDrift
+from bmask_slam.loops.drift import MapDrift, implied_drift
 from bmask_slam.loops.noise import Cycles, LoopNoise, NoiseConfig
 from bmask_slam.loops.place_recognition import PlaceConfig, PlaceRecogniser
 from bmask_slam.loops.verification import LoopConfig, LoopConstraint, NoLoop, loop_view, verify_loop
@@ -260,7 +259,7 @@ class LoopCloser:
         which the map cannot have drifted so far, tells them apart. Most imply so little drift that
         they would fit without any way.
         """
-        implied = _implied_drift(loop, world)
+        implied = implied_drift(loop, world)
 
         def chi2_after(way: Array) -> float:
             S = self.noise.covariance(loop) + self.drift.covariance(way)
@@ -277,7 +276,7 @@ class LoopCloser:
     def _learn_drift(
         self, confirmed: list[LoopConstraint], world: WorldMap, paths: CovisiblePaths
     ) -> None:
-        implied = [_implied_drift(loop, world) for loop in confirmed]
+        implied = [implied_drift(loop, world) for loop in confirmed]
         covariances = [self.noise.covariance(loop) for loop in confirmed]
         self.drift.learn(implied, covariances, [paths.between(*k.ends) for k in confirmed])
 
@@ -289,9 +288,3 @@ class LoopCloser:
         agree = np.zeros((len(loops), len(loops)), bool)
         agree[cycles.first, cycles.second] = comparable & (chi2 < self.config.gate)
         return agree | agree.T
-
-
-def _implied_drift(loop: LoopConstraint, world: WorldMap) -> Array:
-    """The tangent (6,) by which the map's relative pose differs from a loop's."""
-    a, b = (world.keyframes[k].T_world_camera for k in loop.ends)
-    return se3_log(inverse(loop.T_a_b) @ inverse(a) @ b)

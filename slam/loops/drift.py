@@ -7,7 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Arrays
-from bmask_slam.loops.noise import DIMENSIONS, NoiseConfig, diagonal_covariances
+from bmask_slam.graph.factors.checks import mahalanobis
+from bmask_slam.graph.factors.observability import diagonal_covariance
+from bmask_slam.graph.geometry import inverse, se3_log
+from bmask_slam.loops.noise import DIMENSIONS, NoiseConfig
+from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.world.world_map import WorldMap
 
 ROOT_FROM_M = 4.0
 """On longer ways the drift grows with the root of the length, as a sum of independent errors."""
@@ -73,7 +78,7 @@ class MapDrift:
                 continue
             possible = self._covariance(way, 1.0)
             if (np.diagonal(possible) > INFORMATIVE * np.diagonal(own)).all():
-                shares.append(float(xi @ np.linalg.solve(possible, xi)) / DIMENSIONS)
+                shares.append(float(mahalanobis(xi[None], possible[None])[0]) / DIMENSIONS)
         if shares:
             self._sum += float(np.mean(shares))
             self._closings += 1
@@ -90,4 +95,10 @@ class MapDrift:
         sigma_rad = np.hypot(rules.model_sigma_rad + share * bent, share * drift_rad)
         drift_m = np.hypot(rules.drift_m_per_m * growth_m, drift_rad / 2 * away_m)
         sigma_m = np.hypot(rules.model_sigma_m + share * bent, share * drift_m)
-        return diagonal_covariances(np.array([sigma_rad, sigma_m]))
+        return diagonal_covariance(sigma_rad, sigma_m)
+
+
+def implied_drift(loop: LoopConstraint, world: WorldMap) -> Array:
+    """The tangent (6,) by which the map's relative pose differs from a loop's."""
+    a, b = (world.keyframes[k].T_world_camera for k in loop.ends)
+    return se3_log(inverse(loop.T_a_b) @ inverse(a) @ b)

@@ -142,7 +142,7 @@ class LoopNoise:
         change = np.linalg.norm(se3_log(T_a_b).reshape(-1, 2, 3), axis=2)
         rules = self.config
         floor = np.array([rules.model_sigma_rad, rules.model_sigma_m])
-        return diagonal_covariances(floor + rules.model_share * change)
+        return _diagonal(floor + rules.model_share * change)
 
     def map_covariances(self, paths: Array) -> Array:
         """Covariances (..., 6, 6) of the map's relative pose over paths (..., 2) in rad and metres.
@@ -153,9 +153,9 @@ class LoopNoise:
         bent, drift_rad = rules.model_share * turns_rad, rules.drift_rad_per_m * lengths_m
         sigmas_rad = rules.model_sigma_rad + drift_rad + bent
         sigmas_m = rules.model_sigma_m + (rules.drift_m_per_m + drift_rad / 2) * lengths_m + bent
-        return diagonal_covariances(np.stack([sigmas_rad, sigmas_m], axis=-1))
+        return _diagonal(np.stack([sigmas_rad, sigmas_m], axis=-1))
 
 
-def diagonal_covariances(sigmas: Array) -> Array:
+def _diagonal(sigmas: Array) -> Array:
     """Covariances (..., 6, 6) of sigmas (..., 2), one for the rotations, one for translations."""
     return np.repeat(sigmas**2, 3, axis=-1)[..., None] * np.eye(DIMENSIONS)

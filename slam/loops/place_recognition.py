@@ -60,7 +60,9 @@ class PlaceRecogniser:
         self.index = index
         self.config = config or PlaceConfig()
         self._previous: list[tuple[frozenset[int], int]] = []
-        self._dismissed: dict[int, int] = {}  # keyframe of the place, and the last that was there
+        self._dismissed: dict[
+            int, int
+        ] = {}  # keyframe of a place, and the last that looked like it
 
     def state(self) -> Arrays:
         """The groups that the last query found, and what was dismissed."""

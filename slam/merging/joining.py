@@ -12,8 +12,9 @@ from bmask_slam.back_end.segment_joining import move_segment
 from bmask_slam.events import Ends
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import inverse, se3_log
+from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.loops.drift import implied_drift
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.merging.common_places import CommonPlaces, T_older_newer
 from bmask_slam.refinement.carried_along import move_frames
@@ -153,9 +154,5 @@ def _fitting(mapper: Mapper, places: CommonPlaces) -> dict[Ends, LoopConstraint]
 
 
 def _residuals(system: SlamSystem, loops: Sequence[LoopConstraint]) -> Array:
-    keyframes = system.mapper.world.keyframes
-    found = []
-    for loop in loops:
-        a, b = (keyframes[k].T_world_camera for k in loop.ends)
-        found.append(se3_log(inverse(loop.T_a_b) @ inverse(a) @ b))
+    found = [implied_drift(loop, system.mapper.world) for loop in loops]
     return np.array(found).reshape(-1, 6)

@@ -28,6 +28,7 @@ class CovisiblePaths:
     def __init__(self, world: WorldMap) -> None:
         """Nothing is computed before the first way is asked for."""
         self._world = world
+        self._before: dict[int, Ints] = {}  # of each b, the keyframe before each on the way from it
 
     def between(self, a: int, b: int) -> Array:
         """The shortest way between keyframes (3,): radians, metres, and how far it leads away.
@@ -36,7 +37,10 @@ class CovisiblePaths:
         """
         ids, poses, costs = self._graph
         here, source = np.searchsorted(ids, [a, b]).tolist()
-        _, before = dijkstra(costs, directed=False, indices=source, return_predecessors=True)
+        if source not in self._before:
+            found = dijkstra(costs, directed=False, indices=source, return_predecessors=True)
+            self._before[source] = found[1]
+        before = self._before[source]
         if here != source and before[here] < 0:
             return np.full(3, np.inf)
         way = [here]
