@@ -69,8 +69,8 @@ def can_join(
     gap_s = begin_s - stamps_s[last]
     moved = T_other_segment @ own[0].T_world_camera - poses[last]
     paths = CovisiblePaths(world)
-    ways = paths.between(own[0].id, own[-1].id) + paths.between(before[-1].id, nearest.id)
-    return bool(np.linalg.norm(moved[:3, 3]) < config.reach_m(gap_s, ways[1]))
+    ways_m = paths.length_m(own[0].id, own[-1].id) + paths.length_m(before[-1].id, nearest.id)
+    return bool(np.linalg.norm(moved[:3, 3]) < config.reach_m(gap_s, ways_m))
 
 
 def move_segment(world: WorldMap, segment: int, T_other_segment: Array, target: int) -> None:

@@ -259,14 +259,19 @@ class LoopCloser:
         which the map cannot have drifted so far, tells them apart. Most imply so little drift that
         they would fit without any way.
         """
-        implied = implied_drift(loop, world)
+        implied, own = implied_drift(loop, world), self.noise.covariance(loop)
 
         def chi2_after(way: Array) -> float:
-            S = self.noise.covariance(loop) + self.drift.covariance(way)
+            S = own + self.drift.covariance(way)
             return float(mahalanobis(implied[None], S[None])[0])
 
         gate = self.config.gate
-        if chi2_after(np.zeros(3)) < gate or (chi2 := chi2_after(paths.between(*loop.ends))) < gate:
+        if chi2_after(world.keyframes[loop.keyframe_b].T_world_camera[None]) < gate:
+            return True
+        way = paths.way(*loop.ends)
+        if not len(way):
+            return True
+        if (chi2 := chi2_after(way)) < gate and not self.drift.alike_elsewhere(implied, own, way):
             return True
         reason = f"{loop.inliers} inliers, but it implies more drift than is possible"
         self._events.loop_refused(loop.ends, reason)
@@ -278,7 +283,7 @@ class LoopCloser:
     ) -> None:
         implied = [implied_drift(loop, world) for loop in confirmed]
         covariances = [self.noise.covariance(loop) for loop in confirmed]
-        self.drift.learn(implied, covariances, [paths.between(*k.ends) for k in confirmed])
+        self.drift.learn(implied, covariances, [paths.way(*k.ends) for k in confirmed])
 
     def _agreement(self, loops: list[LoopConstraint], world: WorldMap) -> Mask:
         """(N, N) whether loops agree; False where their paths are too long to compare."""

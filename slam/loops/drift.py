@@ -9,13 +9,13 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Arrays
 from bmask_slam.graph.factors.checks import mahalanobis
 from bmask_slam.graph.factors.observability import diagonal_covariance
-from bmask_slam.graph.geometry import inverse, se3_log
+from bmask_slam.graph.geometry import adjoint, inverse, se3_exp, se3_log
 from bmask_slam.loops.noise import DIMENSIONS, NoiseConfig
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.world.world_map import WorldMap
 
-ROOT_FROM_M = 4.0
-"""On longer ways the drift grows with the root of the length, as a sum of independent errors."""
+ALIKE_FOR_M = 4.0
+"""For so much of a way errors are alike; on longer ways they are a sum of independent ones."""
 INFORMATIVE = 9.0
 """Loops tell of the drift where its covariance is so many times as large as their own."""
 
@@ -29,8 +29,9 @@ class MapDrift:
     ``prior_closings`` closings that found all of it, and with a margin.
 
     A map in which places look alike, as the rooms of an office do, is held to ``alike_share`` of
-    the drift: there a wrong loop is likelier than a map that has drifted far. That they do is known
-    by a verified loop which is far from possible: by ``alike_excess`` times the chi-square allowed.
+    the drift: there a wrong loop is likelier than a map that has drifted far (`alike_elsewhere`).
+    That they do is known by a verified loop which is far from possible: by ``alike_excess`` times
+    the chi-square allowed.
 
     Attributes:
         places_look_alike: whether such a loop was found.
@@ -59,8 +60,23 @@ class MapDrift:
         self._sum, self._closings, self.places_look_alike = learned_sum, int(closings), bool(alike)
 
     def covariance(self, way: Array) -> Array:
-        """Covariance (6, 6) of the map's relative pose over a way (3,), see ``CovisiblePaths``."""
-        return self._covariance(way, np.sqrt(self.scale))
+        """Covariance (6, 6) of T_a_b, as a tangent in b, by a way's poses (N, 4, 4) from a to b."""
+        return self._floor + self.scale * self._possible(way)
+
+    def alike_elsewhere(self, implied: Array, own: Array, way: Array) -> bool:
+        """Whether a loop is explained better by a place that looks alike than by drift.
+
+        Drift puts the camera (6,) ``implied`` away with a density that falls with the covariances
+        (6, 6) of the loop and of the way; places that look alike are one in ``alike_spacing_m``
+        cubed. The longer the way, the less tells even a loop that implies no drift.
+        """
+        if not self.places_look_alike:
+            return False
+        S = (own + self.covariance(way))[3:, 3:]
+        minus_2_log = float(mahalanobis(implied[None, 3:], S[None])[0])
+        minus_2_log += float(np.linalg.slogdet(2 * np.pi * S)[1])
+        rules = self.config
+        return minus_2_log > 2 * np.log(rules.alike_spacing_m**3 / rules.alike_odds)
 
     def learn(
         self, implied: Sequence[Array], covariances: Sequence[Array], ways: Sequence[Array]
@@ -70,32 +86,44 @@ class MapDrift:
         Args:
             implied: (6,) the drift that each implies, as a tangent [rotation rad, m].
             covariances: (6, 6) of the loops themselves.
-            ways: (3,) the ways between their ends, on which the map has drifted.
+            ways: poses (N, 4, 4) on the ways between their ends; N = 0 is no way.
         """
         shares = []
         for xi, own, way in zip(implied, covariances, ways, strict=True):
-            if not np.isfinite(way).all():
-                continue
-            possible = self._covariance(way, 1.0)
-            if (np.diagonal(possible) > INFORMATIVE * np.diagonal(own)).all():
+            possible = self._floor + self._possible(way)
+            if len(way) and (np.diagonal(possible) > INFORMATIVE * np.diagonal(own)).all():
                 shares.append(float(mahalanobis(xi[None], possible[None])[0]) / DIMENSIONS)
         if shares:
             self._sum += float(np.mean(shares))
             self._closings += 1
 
-    def _covariance(self, way: Array, share: float) -> Array:
-        """With so much of what ``NoiseConfig`` states.
+    @property
+    def _floor(self) -> Array:
+        return diagonal_covariance(self.config.model_sigma_rad, self.config.model_sigma_m)
 
-        On a long way independent errors add up as squares, and an error of rotation displaces the
-        end as far as the way leads away.
+    def _possible(self, way: Array) -> Array:
+        """The drift that ``NoiseConfig`` states, carried to the end of a way by adjoints.
+
+        An error of the camera model or of the depth's scale is the same for the whole way, so that
+        those of turns to the left and to the right cancel, and those of the way there and back:
+        each component of a turn adds an unknown multiple of itself to all six of the step, each
+        move is too long by an unknown share. Other errors are alike for ``ALIKE_FOR_M`` of a way.
         """
-        rules, (turn_rad, length_m, away_m) = self.config, way
-        growth_m = np.minimum(length_m, np.sqrt(ROOT_FROM_M * length_m))
-        bent, drift_rad = rules.model_share * turn_rad, rules.drift_rad_per_m * growth_m
-        sigma_rad = np.hypot(rules.model_sigma_rad + share * bent, share * drift_rad)
-        drift_m = np.hypot(rules.drift_m_per_m * growth_m, drift_rad / 2 * away_m)
-        sigma_m = np.hypot(rules.model_sigma_m + share * bent, share * drift_m)
-        return diagonal_covariance(sigma_rad, sigma_m)
+        if len(way) < 2:
+            return np.zeros((DIMENSIONS, DIMENSIONS))
+        rules = self.config
+        steps = se3_log(inverse(way[:-1]) @ way[1:])
+        to_end = adjoint(inverse(way[-1]) @ way[:-1] @ se3_exp(steps / 2))
+        bent = np.einsum("nij,nk->ijk", to_end, steps[:, :3]).reshape(DIMENSIONS, -1)
+        lengths_m = np.linalg.norm(steps[:, 3:], axis=1)
+        walked_m = np.cumsum(lengths_m) - lengths_m
+        begins = np.flatnonzero(np.diff(walked_m // ALIKE_FOR_M, prepend=-1.0))
+        walked = np.add.reduceat(to_end * lengths_m[:, None, None], begins)
+        per_m = diagonal_covariance(rules.drift_rad_per_m, rules.drift_m_per_m)
+        drifted = (walked @ per_m @ walked.swapaxes(1, 2)).sum(axis=0)
+        too_long = np.einsum("nij,nj->i", to_end[:, :, 3:], steps[:, 3:])
+        scale = rules.drift_m_per_m**2 * np.outer(too_long, too_long)
+        return rules.model_share**2 * bent @ bent.T + scale + drifted
 
 
 def implied_drift(loop: LoopConstraint, world: WorldMap) -> Array:

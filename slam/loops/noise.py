@@ -30,7 +30,9 @@ class NoiseConfig:
     away. Without any path the sigmas are ``model_sigma_rad`` and ``model_sigma_m``. How far the map
     can have drifted over long ways is learned from loops (`loops.drift`), with the weight of
     ``prior_closings`` and the factor ``drift_margin`` on the covariance; where places look alike,
-    by a loop with ``alike_excess`` times the chi-square allowed, it is ``alike_share`` of that.
+    by a loop with ``alike_excess`` times the chi-square allowed, it is ``alike_share`` of that, and
+    a loop must be ``alike_odds`` times likelier to be right than to be of one of the look-alikes,
+    which are ``alike_spacing_m`` apart.
     """
 
     prior_ratio: float = 4.0
@@ -45,6 +47,8 @@ class NoiseConfig:
     drift_margin: float = 2.0
     alike_excess: float = 9.0
     alike_share: float = 0.2
+    alike_spacing_m: float = 3.0
+    alike_odds: float = 10.0
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.factors.checks import chi2_quantile
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import (
-    ANCHOR,
     FIRST_FRAME,
     GRAVITY,
     MARKER,
@@ -29,9 +28,7 @@ from bmask_slam.graph.factors.graph_update import (
     RelativePose,
     RelativePoseName,
 )
-from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.files.array_file import nested, part
-from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.inertial.tables import InertialState
 from bmask_slam.graph.sensors.accelerometer import Plumb
 from bmask_slam.graph.sensors.config import SensorsConfig
@@ -56,10 +53,6 @@ from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
-MIN_SHARED = 15
-"""A new keyframe that shares fewer landmarks with the one before is held to it weakly ..."""
-WEAK_COVARIANCE = diagonal_covariance(0.05, 0.1)
-"""... as a keyframe that a removal left underconstrained."""
 DEGREES = {ODOMETRY: 6, GRAVITY: 2, POSITION: 3, PLANAR: 3, MARKER: 6, SITE: 6}
 """The kinds of factors, and the degrees of freedom of their errors."""
 KINDS = tuple(DEGREES)
@@ -184,20 +177,13 @@ class SensorFusion:
         return found
 
     def _inertial(self, keyframes: list[Keyframe], tables: FactorTables) -> SensorChanges:
-        """Factors of an IMU; a new keyframe that shares too little is held weakly beside them."""
+        """Factors of an IMU."""
         self.imu.update(keyframes, self.streams)
         if (config := self.imu.config) is None:
             return SensorChanges()
-        update = inertial_update(keyframes, tables.inertial, self.streams, config)
-        weak = []
-        by_id = {k.id: k for k in keyframes}
-        for factor in update.factors:
-            a, b = by_id[factor.keyframe_a], by_id[factor.keyframe_b]
-            shared = np.intersect1d(a.landmark_ids, b.landmark_ids)
-            if len(shared) < MIN_SHARED and not tables.keyframes.contains(np.array([b.id])).all():
-                T_a_b = inverse(a.T_world_camera) @ b.T_world_camera
-                weak.append(RelativePose(a.id, b.id, T_a_b, WEAK_COVARIANCE, kind=ANCHOR))
-        return SensorChanges(relative_poses=tuple(weak), inertial=update)
+        return SensorChanges(
+            inertial=inertial_update(keyframes, tables.inertial, self.streams, config)
+        )
 
     def follow(self, owner: GraphOwner) -> None:
         """The graph was optimised: keep how the camera moves, for a blackout."""

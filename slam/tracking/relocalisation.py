@@ -95,7 +95,7 @@ def is_within_reach(
     moved_m = np.linalg.norm(T_world_camera[:3, 3] - motion.T_world_last[:3, 3])
     if not moved_m > config.reach_m(motion.ago_s) or ends[1] is None:  # NaN: no time of a last pose
         return True
-    way_m = CovisiblePaths(world).between(ends[0].id, ends[1].id)[1]
+    way_m = CovisiblePaths(world).length_m(ends[0].id, ends[1].id)
     return bool(moved_m < config.reach_m(motion.ago_s, way_m))
 
 

@@ -30,11 +30,8 @@ class CovisiblePaths:
         self._world = world
         self._before: dict[int, Ints] = {}  # of each b, the keyframe before each on the way from it
 
-    def between(self, a: int, b: int) -> Array:
-        """The shortest way between keyframes (3,): radians, metres, and how far it leads away.
-
-        The last are the metres from a to the furthest keyframe on it. All are inf if there is none.
-        """
+    def way(self, a: int, b: int) -> Array:
+        """T_world_camera (N, 4, 4) of keyframes on the shortest way from a to b; N = 0: none."""
         ids, poses, costs = self._graph
         here, source = np.searchsorted(ids, [a, b]).tolist()
         if source not in self._before:
@@ -42,12 +39,17 @@ class CovisiblePaths:
             self._before[source] = found[1]
         before = self._before[source]
         if here != source and before[here] < 0:
-            return np.full(3, np.inf)
+            return poses[:0]
         way = [here]
         while way[-1] != source:
             way.append(int(before[way[-1]]))
-        away_m = np.linalg.norm(poses[way, :3, 3] - poses[here, :3, 3], axis=1).max()
-        return np.append(step_lengths(poses[way[:-1]], poses[way[1:]]).sum(axis=0), away_m)
+        return poses[way]
+
+    def length_m(self, a: int, b: int) -> float:
+        """Metres of the shortest way between keyframes; inf if there is none."""
+        way = self.way(a, b)
+        steps = np.diff(way[:, :3, 3], axis=0)
+        return float(np.linalg.norm(steps, axis=1).sum()) if len(way) else np.inf
 
     @cached_property
     def _graph(self) -> tuple[Ints, Array, csr_array]:

@@ -140,30 +140,78 @@ def test_what_a_bent_map_adds_grows_with_the_change_and_has_units() -> None:
     np.testing.assert_allclose(sigmas[1], np.repeat([0.003, 0.045], 3))
 
 
+def straight(length_m: int) -> Array:
+    """Poses (N, 4, 4) of steps of 1 m along the optical axis."""
+    return se3_exp(np.arange(length_m + 1.0)[:, None] * [0, 0, 0, 0, 0, 1])
+
+
+def sweeping(turns_rad: list[float]) -> Array:
+    """Poses (N, 4, 4) of a camera that turns on the spot."""
+    return se3_exp(np.cumsum([0.0, *turns_rad])[:, None] * [0, 1, 0, 0, 0, 0])
+
+
+def walk() -> Array:
+    """Poses (41, 4, 4): 40 steps of 0.6 m that turn at random."""
+    turns = np.random.default_rng(3).normal(size=(40, 3)) * [0.05, 0.2, 0.05]
+    poses = [np.eye(4)]
+    for turn in turns:
+        poses.append(poses[-1] @ se3_exp([*turn, 0, 0, 0.6]))
+    return np.array(poses)
+
+
 @pytest.mark.parametrize(
     ("way", "sigma_rad", "sigma_m"),
     [
-        ((0.0, 0.0, 0.0), 0.003, 0.005),
-        ((1.0, 0.0, 0.0), 0.023, 0.025),
-        ((0.0, 1.0, 1.0), np.hypot(0.003, 0.005), np.hypot(0.005, np.hypot(0.02, 0.0025))),
-        ((0.0, 100.0, 30.0), np.hypot(0.003, 0.1), np.hypot(0.005, np.hypot(0.4, 1.5))),
+        (straight(0), 0.003, (0.005, 0.005)),
+        (
+            straight(4),
+            np.hypot(0.003, 0.02),
+            (0.0895, np.hypot(0.005, np.hypot(0.08, 0.08))),
+        ),  # alike all the way
+        (straight(100), np.hypot(0.003, 0.1), (5.786, np.hypot(2.0, 0.4))),  # with the root
+        (sweeping([1.0]), np.hypot(0.003, 0.02), (0.0206, 0.0206)),
+        (sweeping([1.0, -1.0] * 50), 0.003, (0.005, 0.005)),  # turns to both sides cancel
+        (sweeping([np.pi / 6] * 12), np.hypot(0.003, 0.04 * np.pi), (0.005, 0.005)),  # a circle
     ],
 )
-def test_drift_grows_with_the_root_of_a_long_way(
-    way: tuple[float, ...], sigma_rad: float, sigma_m: float
+def test_how_drift_grows_on_a_way(
+    way: Array, sigma_rad: float, sigma_m: tuple[float, float]
 ) -> None:
-    sigmas = np.sqrt(np.diagonal(MapDrift(NoiseConfig()).covariance(np.array(way))))
-    np.testing.assert_allclose(sigmas, np.repeat([sigma_rad, sigma_m], 3))
+    """The sigmas of turns about y, and of moves sideways and ahead."""
+    sigmas = np.sqrt(np.diagonal(MapDrift(NoiseConfig()).covariance(way)))
+    np.testing.assert_allclose(sigmas[1], sigma_rad, rtol=1e-3)
+    np.testing.assert_allclose(sigmas[[3, 5]], sigma_m, rtol=1e-2)
+
+
+def test_drift_is_that_of_simulated_ways() -> None:
+    """A camera model that bends all turns alike, a scale, and errors that are alike for 4 m."""
+    rules, way, rng = NoiseConfig(), walk(), np.random.default_rng(4)
+    steps = se3_log(inverse(way[:-1]) @ way[1:])
+    blocks = (np.arange(40) * 0.6 // 4).astype(int)
+    per_m = np.repeat([rules.drift_rad_per_m, rules.drift_m_per_m], 3)
+    bends = 0.1 * rules.model_share * rng.normal(size=(4000, 6, 3))
+    walked = 0.1 * per_m * rng.normal(size=(4000, blocks[-1] + 1, 6))[:, blocks]
+    errors = steps[:, :3] @ bends.swapaxes(1, 2) + 0.6 * walked
+    errors[..., 3:] += 0.1 * rules.drift_m_per_m * rng.normal(size=(4000, 1, 1)) * steps[:, 3:]
+    errors = se3_exp(errors)
+    T = np.eye(4)
+    for half, error in zip(se3_exp(steps / 2), errors.swapaxes(0, 1), strict=True):
+        T = T @ half @ error @ half
+    sampled = 100 * np.cov(se3_log(inverse(way[-1]) @ T).T)
+    drift = MapDrift(replace(rules, model_sigma_rad=0.0, model_sigma_m=0.0)).covariance(way)
+    sigmas = np.sqrt(np.diagonal(drift))
+    unit = np.outer(sigmas, sigmas)
+    np.testing.assert_allclose(sampled / unit, drift / unit, atol=0.07)
 
 
 def test_drift_is_less_where_loops_have_shown_less_and_never_more_than_assumed() -> None:
-    """Loops after 20 m of way: their implied drift is 1 % of what was possible, then all of it."""
-    drift, way = MapDrift(NoiseConfig()), np.array([10.0, 20.0, 5.0])
+    """Loops after 24 m of way: their implied drift is 1 % of what was possible, then all of it."""
+    drift, way = MapDrift(NoiseConfig()), walk()
     assumed = drift.covariance(way)
-    sigmas, rng = np.sqrt(np.diagonal(assumed)), np.random.default_rng(5)
-    own, far = 1e-6 * np.eye(6), np.full(3, np.inf)
+    root, rng = np.linalg.cholesky(assumed), np.random.default_rng(5)
+    own, none = 1e-6 * np.eye(6), np.zeros((0, 4, 4))
     for _ in range(20):
-        drift.learn(0.1 * sigmas * rng.normal(size=(3, 6)), [own] * 3, [way] * 3)
+        drift.learn(0.1 * rng.normal(size=(3, 6)) @ root.T, [own] * 3, [way] * 3)
     # (1 + 20 * 0.01) / 21, times 2
     np.testing.assert_allclose(drift.scale, 0.114, rtol=0.1)
     ratio = np.diagonal(drift.covariance(way)) / np.diagonal(assumed)
@@ -175,17 +223,33 @@ def test_drift_is_less_where_loops_have_shown_less_and_never_more_than_assumed()
     known.restore(drift.state())
     assert known.places_look_alike
     drift.places_look_alike = False
-    drift.learn(sigmas[None], [assumed], [way])  # no more precise than the drift
-    drift.learn(sigmas[None], [own], [far])
+    drift.learn(root[:1], [assumed], [way])  # no more precise than the drift
+    drift.learn(root[:1], [own], [none])
     assert drift.scale == before
     again = MapDrift(NoiseConfig())
     again.restore(drift.state())
     assert again.scale == before
     for _ in range(40):
-        drift.learn(2 * sigmas * rng.normal(size=(3, 6)), [own] * 3, [way] * 3)
+        drift.learn(2 * rng.normal(size=(3, 6)) @ root.T, [own] * 3, [way] * 3)
     assert drift.scale == 1.0
     again.restore(MapDrift(NoiseConfig()).state())
     np.testing.assert_array_equal(again.covariance(way), assumed)
+
+
+@pytest.mark.parametrize(
+    ("length_m", "implied_m", "elsewhere"),
+    [(20, 0.1, False), (20, 3.0, True), (100, 1.5, True), (100, 0.3, False), (250, 0.0, True)],
+)
+def test_a_look_alike_must_be_less_likely_than_the_drift(
+    length_m: int, implied_m: float, elsewhere: bool
+) -> None:
+    """There and back, to a place beside where the map has it; after 250 m that tells nothing."""
+    drift = MapDrift(NoiseConfig())
+    way = np.concatenate([straight(length_m // 2), straight(length_m // 2)[-2::-1]])
+    given = np.array([0, 0, 0, implied_m, 0, 0]), STATED, way
+    assert not drift.alike_elsewhere(*given)
+    drift.places_look_alike = True
+    assert drift.alike_elsewhere(*given) == elsewhere
 
 
 def test_a_room_that_looks_like_another_is_no_loop() -> None:

@@ -27,11 +27,14 @@ def out_and_back() -> tuple[WorldMap, list[Keyframe]]:
 
 
 def test_without_common_landmarks_the_way_is_that_of_the_camera() -> None:
-    world, _ = out_and_back()
+    world, keyframes = out_and_back()
     paths = CovisiblePaths(world)
-    np.testing.assert_allclose(paths.between(0, COUNT - 1), [np.pi, 9, 5], atol=1e-9)
-    np.testing.assert_allclose(paths.between(COUNT - 1, 2), [np.pi, 7, 4], atol=1e-9)
-    np.testing.assert_allclose(paths.between(3, 3), [0, 0, 0])
+    np.testing.assert_array_equal(paths.way(0, COUNT - 1), [k.T_world_camera for k in keyframes])
+    np.testing.assert_array_equal(
+        paths.way(COUNT - 1, 2), [k.T_world_camera for k in keyframes[:1:-1]]
+    )
+    np.testing.assert_array_equal(paths.way(3, 3), keyframes[3].T_world_camera[None])
+    assert [paths.length_m(*ends) for ends in ((0, COUNT - 1), (3, 3))] == [9, 0]
 
 
 @pytest.mark.parametrize("shared", [MIN_SHARED - 1, MIN_SHARED])
@@ -40,15 +43,17 @@ def test_landmarks_that_were_seen_again_make_it_shorter(shared: int) -> None:
     rows = np.arange(shared)
     ids = world.make_landmarks(keyframes[2], rows, np.ones((shared, 3)))
     world.attach(keyframes[10], rows, ids)  # where it was before, looking the other way
-    turned, walked, away = CovisiblePaths(world).between(0, COUNT - 1)
-    assert turned == pytest.approx(np.pi)
-    assert (walked, away) == pytest.approx((3, 2) if shared == MIN_SHARED else (9, 5))
+    taken = [0, 1, 2, 10, 11] if shared == MIN_SHARED else range(COUNT)
+    np.testing.assert_array_equal(
+        CovisiblePaths(world).way(0, COUNT - 1), [keyframes[k].T_world_camera for k in taken]
+    )
 
 
 def test_culled_keyframes_are_stepped_over() -> None:
     world, keyframes = out_and_back()
     world.remove_keyframe(keyframes[3], keyframes[2])
-    np.testing.assert_allclose(CovisiblePaths(world).between(0, 5), [0, 5, 5], atol=1e-9)
+    assert CovisiblePaths(world).length_m(0, 5) == 5
+    assert len(CovisiblePaths(world).way(0, 5)) == 5
 
 
 def test_segments_have_no_way_between_them() -> None:
@@ -56,6 +61,6 @@ def test_segments_have_no_way_between_them() -> None:
     for keyframe in keyframes[4:8]:
         keyframe.segment = 1
     paths = CovisiblePaths(world)
-    assert np.isinf(paths.between(0, 5)).all()
-    np.testing.assert_allclose(paths.between(4, 6), [np.pi / 2, 1, 1], atol=1e-9)
-    np.testing.assert_allclose(paths.between(3, 8), [np.pi, 1, 1], atol=1e-9)
+    assert paths.way(0, 5).shape == (0, 4, 4)
+    assert np.isinf(paths.length_m(0, 5))
+    assert [paths.length_m(*ends) for ends in ((4, 6), (3, 8))] == [1, 1]
