@@ -60,9 +60,8 @@ class PlaceRecogniser:
         self.index = index
         self.config = config or PlaceConfig()
         self._previous: list[tuple[frozenset[int], int]] = []
-        self._dismissed: dict[
-            int, int
-        ] = {}  # keyframe of a place, and the last that looked like it
+        # Keyframe of a place, and the last that looked like it
+        self._dismissed: dict[int, int] = {}
 
     def state(self) -> Arrays:
         """The groups that the last query found, and what was dismissed."""
