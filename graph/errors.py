@@ -5,6 +5,8 @@ import math
 from collections.abc import Iterable
 
 MAX_MESSAGE = 2000
+MAX_LINE = 450
+"""Characters of a line that a user is shown: what a file holds may be of any length."""
 
 
 class InputError(Exception):
@@ -19,6 +21,12 @@ class InputError(Exception):
         if len(message) > MAX_MESSAGE:
             message = f"{message[: MAX_MESSAGE // 2]} ... {message[-MAX_MESSAGE // 2 :]}"
         super().__init__(message)
+
+
+def one_line(message: str) -> str:
+    """A message as a line of at most ``MAX_LINE`` characters."""
+    line = " ".join(message.split())
+    return line if len(line) <= MAX_LINE else f"{line[: MAX_LINE - 3]}..."
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

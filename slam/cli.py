@@ -31,7 +31,7 @@ from bmask_slam.commands.run import add_run
 from bmask_slam.commands.segmentation import add_evaluate_segmentation, add_segment, add_train
 from bmask_slam.commands.sequences import add_convert, add_download, add_info, add_render
 from bmask_slam.commands.show import add_doctor, add_film, add_report, add_view
-from bmask_slam.graph.errors import InputError, did_you_mean
+from bmask_slam.graph.errors import InputError, did_you_mean, one_line
 from bmask_slam.graph.extras import import_extra
 from bmask_slam.runtime.memory import is_out_of_memory, memory_limit_bytes
 from bmask_slam.runtime.stop_request import SIGNALS
@@ -92,8 +92,6 @@ WAITING = {"OPENBLAS_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
 second thread of OpenBLAS gains nothing, and spins while it waits. Beside other work on the machine,
 which then waits for a core, a run took two to three times as long."""
 CHOICE = re.compile(r"invalid choice: '(.*?)' \(choose from (.*)\)")
-MAX_LINE = 480
-"""Characters of an error: what a file holds may be of any length."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -194,10 +192,7 @@ def _terminations() -> Iterator[None]:
 
 
 def _fail(message: str) -> int:
-    line = " ".join(message.split())
-    if len(line) > MAX_LINE:
-        line = f"{line[: MAX_LINE - 3]}..."
-    print(f"error: {line}", file=sys.stderr)
+    print(f"error: {one_line(message)}", file=sys.stderr)
     return 1
 
 
@@ -233,7 +228,7 @@ class _Parser(argparse.ArgumentParser):
         if wrong := CHOICE.search(message):
             choices = [choice.strip(" '\"") for choice in wrong[2].split(",")]
             message += did_you_mean(wrong[1], choices)
-        super().error(message)
+        super().error(one_line(message))
 
 
 def _commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:

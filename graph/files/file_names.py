@@ -65,7 +65,14 @@ def refuse_link(path: Path, cure: str = "remove it") -> None:
 
 
 def target_below(root: Path, name: str) -> Path:
-    """A path below ``root`` to write a file to; folders are made, links are not followed.
+    """A path below ``root`` to write a file to; its folder is made, see ``plain_path``."""
+    path = plain_path(root, name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def plain_path(root: Path, name: str) -> Path:
+    """A path below ``root`` without links on the way to it.
 
     Raises:
         InputError: the name leads out of ``root``, or a folder on the way is a link.
@@ -74,5 +81,4 @@ def target_below(root: Path, name: str) -> Path:
     for folder in reversed(path.relative_to(root).parents):
         if folder.parts:
             refuse_link(root / folder)
-    path.parent.mkdir(parents=True, exist_ok=True)
     return path

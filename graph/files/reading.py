@@ -7,6 +7,7 @@ or one line of a gigabyte. Every reader of text begins here.
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import os
 import stat
@@ -18,6 +19,8 @@ from bmask_slam.graph.errors import InputError
 MAX_BYTES = 1 << 30
 MAX_TEXT_BYTES = 1 << 28
 MAX_LINE = 1 << 16
+NOT_THE_FILE = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EIO)
+"""Errors of the machine; another file would fail as well."""
 SMALL_BYTES, MAX_RATIO = 1 << 28, 100
 """A file may unpack to so many bytes, or to so many times its own."""
 
@@ -39,6 +42,7 @@ def read_bytes(path: Path, cure: str, limit: int = MAX_BYTES) -> bytes:
     Raises:
         InputError: no such file, a folder or a device, one that cannot be read, or one that is
             larger than ``limit`` bytes; the line ends with the ``cure``.
+        OSError: the machine has no descriptors or memory left, or its disk fails.
     """
     try:
         with open(path, "rb", opener=_without_waiting) as file:
@@ -53,6 +57,8 @@ def read_bytes(path: Path, cure: str, limit: int = MAX_BYTES) -> bytes:
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; {cure}") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        if getattr(error, "errno", None) in NOT_THE_FILE:
+            raise
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: cannot be read ({reason}); {cure}") from error
 

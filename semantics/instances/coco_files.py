@@ -15,10 +15,11 @@ import numpy as np
 from pycocotools import mask as coco_mask
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
-from bmask_slam.graph.arrays import Array, Ints, Mask
+from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import check_name
 from bmask_slam.graph.files.json_file import STRICT, Name, first_problem, read_json
+from bmask_slam.semantics.instances.run_lengths import encoded_lengths
 from bmask_slam.semantics.labels import LabelSet, label_set
 
 logger = logging.getLogger(__name__)
@@ -30,6 +31,10 @@ MAX_CORNERS = 100_000
 """Of a polygon."""
 MAX_PERIMETER_PX = 10_000_000
 """Of a polygon: pycocotools takes memory for each pixel on its edges, also outside the image."""
+EDGE_PX_A_BYTE = 20
+"""Of all polygons, for each byte of the file, beside those of one polygon: real ones have one."""
+MAX_MASK_BYTES = 1 << 30
+"""Of the masks of one image, decoded, a byte a pixel."""
 Id = Annotated[int, Field(ge=-(2**53), le=2**53)]
 Side = Annotated[int, Field(ge=1, le=MAX_SIDE)]
 Probability = Annotated[float, Field(ge=0, le=1 + 1e-6)]
@@ -144,11 +149,13 @@ def read_coco(path: Path) -> CocoFile:
     labels = {number: k for k, (number, _) in enumerate(categories, 1)}
     objects: dict[int, list[CocoObject]] = defaultdict(list)
     problems: list[str] = []
+    edges = _Edges(MAX_PERIMETER_PX + EDGE_PX_A_BYTE * path.stat().st_size)
     for raw in content.annotations:
         try:
             annotation = _checked(raw, images, labels)
             image, label = images[annotation.image_id], labels[annotation.category_id]
-            runs = _encoded(annotation, image, f"annotation {_name(raw)}", problems)
+            _check_room(len(objects[image.id]), image)
+            runs = _encoded(annotation, image, f"annotation {_name(raw)}", problems, edges)
             objects[image.id].append(_object(annotation, label, runs))
         except ValueError as error:
             problems.append(f"annotation {_name(raw)}: {error}; left out")
@@ -177,6 +184,25 @@ def _checked_images(listed: list[_Image], path: Path) -> dict[int, _Image]:
                 f"{MAX_PIXELS // 10**6} megapixels; correct its size"
             )
     return {image.id: image for image in listed}
+
+
+def _check_room(present: int, image: _Image) -> None:
+    """Raise ValueError if an image has so many objects that their masks would take all memory."""
+    if (present + 1) * image.height * image.width > MAX_MASK_BYTES:
+        raise ValueError(f"image {image.id} has {present} objects, which is the limit of its size")
+
+
+@dataclass
+class _Edges:
+    """How many pixels of edges the polygons of a file may still have."""
+
+    left_px: float
+
+    def take(self, pixels: float) -> None:
+        """Raise ValueError if there are not so many left."""
+        if pixels > self.left_px:
+            raise ValueError("segmentation: the edges of the file's polygons are too long")
+        self.left_px -= pixels
 
 
 def _name(annotation: object) -> str:
@@ -211,16 +237,16 @@ def _object(annotation: _Annotation, label: int, runs: dict[str, Any]) -> CocoOb
 
 
 def _encoded(
-    annotation: _Annotation, image: _Image, where: str, problems: list[str]
+    annotation: _Annotation, image: _Image, where: str, problems: list[str], edges: _Edges
 ) -> dict[str, Any]:
     """The mask as compressed run lengths. Raises ValueError with the reason if it is invalid."""
     given = annotation.segmentation
     if given is None:
         raise ValueError("no segmentation")
     if isinstance(given, _RunLengths):
-        runs = _run_lengths(given, image)
+        runs = encoded_lengths(given.counts, given.size, [image.height, image.width])
     else:
-        polygons = [_polygon(points) for points in given]
+        polygons = [_polygon(points, edges) for points in given]
         good = [points for points in polygons if points is not None]
         if len(good) < len(given):
             problems.append(f"{where}: {len(given) - len(good)} invalid polygons left out")
@@ -232,8 +258,8 @@ def _encoded(
     return dict(runs)
 
 
-def _polygon(points: object) -> list[float] | None:
-    """At least three corners as a flat list of x, y; None for anything else."""
+def _polygon(points: object, edges: _Edges) -> list[float] | None:
+    """At least three corners as a flat list of x, y; None for anything else. Raises ValueError."""
     try:
         flat = _POLYGON.validate_python(points)
     except ValidationError:
@@ -241,49 +267,8 @@ def _polygon(points: object) -> list[float] | None:
     if len(flat) % 2:
         return None
     corners: Array = np.array(flat).reshape(-1, 2)
-    edges = np.abs(corners - np.roll(corners, 1, axis=0)).max(axis=1)
-    far = np.abs(corners).max() > MAX_PERIMETER_PX
-    return None if far or edges.sum() > MAX_PERIMETER_PX else flat
-
-
-def _run_lengths(given: _RunLengths, image: _Image) -> dict[str, Any]:
-    """Compressed run lengths from compressed or plain ones."""
-    size = [image.height, image.width]
-    if given.size != size:
-        raise ValueError(f"a mask of size {given.size} in {size}")
-    if isinstance(given.counts, str):
-        lengths = decoded_lengths(given.counts)
-    else:
-        lengths = np.array(given.counts, np.int64)
-    if lengths.sum() != image.height * image.width or lengths.min(initial=0) < 0:
-        raise ValueError(f"run lengths that do not add up to {image.height * image.width} pixels")
-    if isinstance(given.counts, str):
-        return {"size": size, "counts": given.counts.encode("ascii")}
-    plain = {"size": size, "counts": lengths.tolist()}
-    return dict(coco_mask.frPyObjects(plain, image.height, image.width))
-
-
-def decoded_lengths(text: str) -> Ints:
-    """The run lengths (N,) in COCO's compressed text; they may not make sense, but are finite.
-
-    A number takes one to seven characters with five bits each, the lowest first; from the fourth
-    number on it is the difference to the number two places before.
-
-    Raises:
-        ValueError: other characters, a number that does not end, or one of more than 35 bits.
-    """
-    codes: Ints = np.frombuffer(text.encode("utf-8"), np.uint8).astype(np.int64) - 48
-    if len(codes) == 0 or codes.min() < 0 or codes.max() > 63 or codes[-1] & 32:
-        raise ValueError("run lengths that are no compressed numbers")
-    ends = np.flatnonzero((codes & 32) == 0)
-    first = np.concatenate(([0], ends[:-1] + 1))
-    if (ends - first).max() > 6:
-        raise ValueError("run lengths that are no compressed numbers")
-    place = np.arange(len(codes)) - np.repeat(first, ends - first + 1)
-    values = np.add.reduceat((codes & 31) << (5 * place), first)
-    negative = (codes[ends] & 16) > 0
-    values -= np.where(negative, 1 << (5 * (ends - first + 1)), 0)
-    tail = values[1:]  # of the first number nothing is subtracted
-    for start in (0, 1):
-        tail[start::2] = np.cumsum(tail[start::2])
-    return values
+    around_px = np.abs(corners - np.roll(corners, 1, axis=0)).max(axis=1).sum()
+    if np.abs(corners).max() > MAX_PERIMETER_PX or around_px > MAX_PERIMETER_PX:
+        return None
+    edges.take(float(around_px))
+    return flat

@@ -1,11 +1,13 @@
-"""Decoding of image files, with a clear error for each way in which they can be broken."""
+"""Image files: decoded with a clear error for each way to be broken, and written whole."""
 
 from __future__ import annotations
 
 import io
+import math
 import os
 import struct
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -24,8 +26,12 @@ FORMATS = ("PNG", "JPEG", "PPM", "BMP", "TIFF", "WEBP")
 _TAIL_BYTES = 4096
 _BYTES = {"I;16": 2, "I;16B": 2, "I": 4, "F": 4}
 """Of a value, by Pillow's mode, where it is not 1. A pixel of over 4 bytes counts as several."""
+PNG = b"\x89PNG\r\n\x1a\n"
+_PNG_CHUNK = 12
+"""Bytes of a PNG's chunk beside its data: length, kind, checksum."""
+_PNG_SIDES = slice(16, 24)
+"""Where a PNG has its width and height, followed by how many bits a value has."""
 _PNG_BITS = 24
-"""Where a PNG says how many bits a value has."""
 _PNG_PIXELS_A_BYTE = 8 * 1032
 """More cannot come from a byte: of one bit each, at the highest ratio of deflate."""
 warnings.filterwarnings("ignore", module=r"PIL\.")  # said here in one line
@@ -44,6 +50,19 @@ def read_colour(path: Path) -> Image:
 def decode_colour(data: bytes, where: str) -> Image:
     """``read_colour`` of the bytes of a file; ``where`` names their origin in errors."""
     return _as_colour(decode_bytes(data, _COLOUR, where), where)
+
+
+def write_image(path: Path, picture: NDArray, options: Sequence[int] = ()) -> None:
+    """Write an image (H, W, 3), red first, or grey (H, W) of 8 or 16 bits, as the suffix says.
+
+    ``options`` are those of OpenCV, whose own writer takes a full disk for success.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    if picture.ndim == 3:
+        picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+    path.write_bytes(cv2.imencode(path.suffix, picture, options)[1].tobytes())
 
 
 def _as_colour(bgr: NDArray, where: str) -> Image:
@@ -82,22 +101,47 @@ def decode_bytes(data: bytes, flags: int, where: str) -> NDArray:
 
 def _has_possible_size(data: bytes, where: str) -> bool:
     """Whether the file's header can be read. Raises InputError if the image would be too large."""
+    is_png = data.startswith(PNG)
     try:
         header = PIL.Image.open(io.BytesIO(data), formats=FORMATS)
         (width, height), bytes_each = header.size, len(header.getbands())
         bytes_each *= _BYTES.get(header.mode, 1)
     except PIL.Image.DecompressionBombError:
-        width = height = 1 << 20
+        width, height = struct.unpack(">II", data[_PNG_SIDES]) if is_png else (1 << 20, 1 << 20)
         bytes_each = 1
     except (OSError, ValueError, SyntaxError, OverflowError, struct.error):
         return False
-    is_png = data.startswith(b"\x89PNG")
     if is_png and data[_PNG_BITS] == 16:
         bytes_each = 2 * len(header.getbands())
-    limit = float(os.environ.get(LIMIT, MAX_MEGAPIXELS))
+    limit = _limit_megapixels()
     if width * height * max(1, bytes_each / 4) > limit * 1e6:
         raise InputError(
             f"{where}: {width} x {height} pixels, more than {limit:g} megapixels; scale it "
             f"down, or set {LIMIT}"
         )
-    return not is_png or width * height <= _PNG_PIXELS_A_BYTE * len(data)
+    if not is_png:
+        return True
+    return width * height <= _PNG_PIXELS_A_BYTE * len(data) and _has_possible_chunks(data)
+
+
+def _has_possible_chunks(data: bytes) -> bool:
+    """Whether a PNG has all bytes that its chunks say, for which OpenCV takes memory at once."""
+    begin = len(PNG)
+    while begin + _PNG_CHUNK <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, begin)
+        begin += _PNG_CHUNK + length
+        if kind == b"IEND":
+            return begin <= len(data)
+    return False
+
+
+def _limit_megapixels() -> float:
+    """The limit in force. Raises InputError if the user has set something else than a number."""
+    given = os.environ.get(LIMIT, "")
+    try:
+        limit = float(given or MAX_MEGAPIXELS)
+    except ValueError:
+        limit = math.nan
+    if not 0 < limit < math.inf:
+        raise InputError(f"{LIMIT}={given[:40]}: is no positive number; set megapixels, as 200")
+    return limit

@@ -27,14 +27,13 @@ def write_surfaces(folder: Path, name: str, seen: SurfaceClasses) -> None:
     Raises:
         InputError: the folder has classes of another label set.
     """
-    names = folder / FOLDER / NAMES
+    names = target_below(folder, f"{FOLDER}/{NAMES}")
     before = surface_labels(folder)
     if before is not None and before != seen.labels:
         raise InputError(
             f"{names}: other classes than the segmenter's; choose another --out or delete {folder}"
         )
     if before is None:
-        names.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(names) as temporary:
             temporary.write_text("\n".join(seen.labels.names[1:]) + "\n", encoding="utf-8")
     data = cv2.imencode(".png", seen.codes())[1]

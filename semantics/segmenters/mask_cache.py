@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 from pydantic import BaseModel
 
 from bmask_slam.graph.arrays import Image
@@ -17,7 +16,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import target_below
 from bmask_slam.graph.files.json_file import STRICT, read_json
 from bmask_slam.graph.whole_file import whole_file
-from bmask_slam.semantics.instances.image_files import read_colour
+from bmask_slam.semantics.instances.image_files import read_colour, write_image
 from bmask_slam.semantics.instances.instances import Instance, as_annotation
 from bmask_slam.semantics.instances.overlay import draw, draw_surfaces
 from bmask_slam.semantics.instances.surface_files import write_surfaces
@@ -159,7 +158,7 @@ def _written(
         picture = draw(below, instances, labels)
         target = target_below(options.out, f"overlays/{name}").with_suffix(".jpg")
         with whole_file(target) as temporary:
-            cv2.imwrite(str(temporary), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+            write_image(temporary, picture)
     height, width = image.shape[:2]
     annotations = [as_annotation(i) for i in instances]
     return {"file_name": name, "height": height, "width": width, "annotations": annotations}

@@ -10,7 +10,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
-from bmask_slam.semantics.instances.coco_files import CocoImage, read_coco
+from bmask_slam.semantics.instances.coco_files import MAX_MASK_BYTES, CocoImage, read_coco
 from bmask_slam.semantics.instances.image_files import decode_image
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.instances.surface_files import read_surfaces, surface_labels
@@ -140,8 +140,13 @@ class LabelImageSegmenter:
                 f"{path}: shape {values.shape}, but the image has {image.shape[:2]}; "
                 "label images have one channel and their image's size"
             )
-        found = []
-        for value in np.unique(values[values > 0]).tolist():
+        found, present = [], np.unique(values[values > 0])
+        if len(present) * values.size > MAX_MASK_BYTES:
+            raise InputError(
+                f"{path}: {len(present)} different values, masks of more than "
+                f"{MAX_MASK_BYTES / 1e9:.1f} GB; give label images with fewer objects"
+            )
+        for value in present.tolist():
             label = value // INSTANCES_A_CLASS if value >= INSTANCES_A_CLASS else value
             if label >= len(self.labels):
                 raise InputError(

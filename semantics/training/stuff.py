@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from bmask_slam.graph.arrays import Bytes, Image
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.whole_file import open_plain, whole_file
 from bmask_slam.semantics.network.backbone.layers import keep_variance
 from bmask_slam.semantics.network.yolox.layers import ConvSiLU
@@ -279,11 +280,12 @@ def _save(out: Path, parts: dict[str, Any], step: int, config: StuffTrainingConf
 def _resume(out: Path, parts: dict[str, Any], config: StuffTrainingConfig) -> int:
     """Load the checkpoint of this training, if there is one; the next step."""
     if not (out / STATE).is_file():
-        (out / CURVES).write_text("step,loss,value\n", encoding="utf-8")
+        with whole_file(out / CURVES) as temporary:
+            temporary.write_text("step,loss,value\n", encoding="utf-8")
         return 0
     content = read_pickle(out / STATE)
     if content["config"] != str(asdict(config)):
-        raise ValueError(f"{out}: holds a training with other settings; choose another folder")
+        raise InputError(f"{out}: holds a training with other settings; choose another folder")
     for name, part in parts.items():
         part.load_state_dict(content[name])
     return int(content["step"])

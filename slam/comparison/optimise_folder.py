@@ -13,6 +13,7 @@ from bmask_slam.comparison.experiment.result import CellStatus
 from bmask_slam.comparison.jobs.bar import JobBar
 from bmask_slam.comparison.jobs.job import Job, Outcome, finished
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.file_names import plain_path, refuse_link
 from bmask_slam.graph.files.reading import read_bytes, read_text
 
 SUFFIXES = (".g2o", ".graph")
@@ -103,7 +104,8 @@ def is_run_folder(path: Path) -> bool:
 
 def _job(path: Path, out: Path, more: tuple[str, ...]) -> Job:
     is_file = path.is_file()
-    product, record = out / path.name, out / JOBS / path.name / "record.json"
+    product, record = out / path.name, plain_path(out, f"{JOBS}/{path.name}/record.json")
+    refuse_link(product)
     # A run that these jobs made before, from another input, is replaced; nobody else's is.
     again = ("--overwrite",) if not is_file and record.is_file() else ()
     arguments = ("optimise", str(path), "--out", str(product), *more, *again)

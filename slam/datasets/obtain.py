@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from bmask_slam.graph.files.file_names import target_below
 from bmask_slam.graph.files.reading import read_lines
 from bmask_slam.graph.files.yaml_file import format_yaml
 from bmask_slam.graph.trajectory import write_tum
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.whole_file import remove, whole_file
 from bmask_slam.sequences.formats.numbered import FPS_HZ
 from bmask_slam.sequences.formats.numbered_folders import icl_truth
 from bmask_slam.sequences.lists import read_associations
@@ -51,15 +52,18 @@ def obtain(
     if place.is_dir():
         return place
     archive = _received(recording, folder, report)
-    unpacked = place.with_name(f".{place.name}.unpacking")
-    shutil.rmtree(unpacked, ignore_errors=True)
+    unpacking = f".{place.name}.unpacking-"
+    for killed in place.parent.glob(f"{unpacking}*"):
+        remove(killed)
+    private = Path(tempfile.mkdtemp(prefix=unpacking, dir=place.parent))
+    unpacked = private / place.name
     try:
         unpack(archive, unpacked, lambda done, total: report("unpack", done, total))
         root = _completed(unpacked, recording)
         _write_received(root / RECEIVED, recording, archive, read_sums(folder / SUMS))
         os.replace(root, place)
     finally:
-        shutil.rmtree(unpacked, ignore_errors=True)
+        shutil.rmtree(private, ignore_errors=True)
     if not keep_archive:
         archive.unlink()
     return place

@@ -32,6 +32,8 @@ def unpack(archive: Path, folder: Path, progress: Progress | None = None) -> Non
             size, or one that holds a link, a device, an absolute path, ".." or a name twice. What
             was unpacked by then is left in the folder.
     """
+    if not archive.is_file():
+        raise InputError(f"{archive}: is no file; give an archive")
     folder.mkdir(parents=True, exist_ok=True)
     unpack_kind = _unpack_zip if zipfile.is_zipfile(archive) else _unpack_tar
     with _archive_errors(archive):

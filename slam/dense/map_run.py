@@ -7,7 +7,6 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -79,11 +78,12 @@ def map_run(options: MapOptions, progress: Progress = lambda done, total: None) 
 
 def remove_stored_frames(run: Path, dense: Path) -> None:
     """Remove the frames that a killed live run had stored, unless a run is being written there."""
-    try:
-        with suppress(FileNotFoundError), (run / FRAME_TABLE).open("rb") as file:
-            lock_file(file, run)
-    except InputError:
-        return
+    if (run / FRAME_TABLE).is_file():
+        try:
+            with (run / FRAME_TABLE).open("rb") as file:
+                lock_file(file, run)
+        except InputError:
+            return
     remove(dense / FRAMES)
 
 

@@ -100,7 +100,7 @@ def _ask_apart(library: str) -> Asked:
     source = FINDERS[library][0]
     try:
         done = subprocess.run(  # nosec B603 # this module, a name of our own table
-            [sys.executable, "-m", "bmask_slam.doctor.cameras", library],
+            [sys.executable, "-P", "-m", "bmask_slam.doctor.cameras", library],
             capture_output=True, text=True, timeout=ASK_S, check=False,
         )  # fmt: skip
         told = json.loads(done.stdout.splitlines()[-1])

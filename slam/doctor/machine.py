@@ -15,7 +15,7 @@ from pathlib import Path
 from bmask_slam.runtime.machine import describe_machine
 from bmask_slam.runtime.memory import memory_limit_bytes
 
-MEMINFO, CGROUP, SHM = Path("/proc/meminfo"), Path("/sys/fs/cgroup"), Path("/dev/shm")  # nosec B108
+MEMINFO, CGROUP, SHM = Path("/proc/meminfo"), Path("/sys/fs/cgroup"), Path("/dev/shm")
 TORCH_S = 120.0
 TORCH = """
 import json, torch
@@ -78,7 +78,7 @@ def find_machine() -> Machine:
     """This machine, now."""
     limit = memory_limit_bytes()
     # what graph/files/disk_arrays.py writes to
-    scratch = os.environ.get("TMPDIR") or ("/var/tmp" if Path("/var/tmp").is_dir() else "")  # nosec B108
+    scratch = os.environ.get("TMPDIR") or ("/var/tmp" if Path("/var/tmp").is_dir() else "")
     folders = dict.fromkeys([str(Path.cwd()), scratch or tempfile.gettempdir()])
     return Machine(
         describe_machine(),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import tempfile
 import time
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.live.health import Health
 from bmask_slam.run_folder.folder import CAMERA, HEALTH, RunFolder
@@ -90,9 +90,9 @@ class Recorder:
 
 def rescued(trajectory: Trajectory) -> str:
     """Write a trajectory to the temporary folder; returns a text that says where, or why not."""
-    path = Path(tempfile.gettempdir()) / f"bmask-slam-{os.getpid()}-trajectory.txt"
     try:
+        path = Path(tempfile.mkdtemp(prefix="bmask-slam-")) / "trajectory.txt"
         write_tum(path, trajectory)
-    except OSError as error:
-        return f"nor could {path} be written ({error.strerror})"
+    except (OSError, InputError) as error:
+        return f"nor could it be written to {tempfile.gettempdir()} ({error})"
     return f"the whole trajectory is in {path}"

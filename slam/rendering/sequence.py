@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import importlib
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -108,12 +109,11 @@ def kinect_camera(config: RenderConfig) -> Camera:
 
 
 def render_sequence(
-    config: RenderConfig, out: Path, progress: Callable[[int, int], None] | None = None
+    config: RenderConfig, out: Path, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Path:
     """Render a sequence to the new folder ``out`` and return it.
 
-    ``progress(done, total)`` is called after every frame. The folder appears under its name only
-    when it is complete.
+    ``progress(done, total)`` is called after every frame. The folder appears when it is complete.
 
     Raises:
         InputError: unknown scene, impossible number, or ``out`` not empty or not writable.
@@ -122,10 +122,10 @@ def render_sequence(
     with new_folder(Path(out)) as folder:
         load_open3d()  # if it is not there, that is said before a room is built
         job = _prepare(config, folder)
-        visible: list[list[VisibleInstance]] = []
-        for found in _draw_all(job):
-            visible.append(found)
-            if progress is not None:
+        visible = []
+        with closing(_draw_all(job)) as drawn:  # whatever happens, no thread writes afterwards
+            for found in drawn:
+                visible.append(found)
                 progress(len(visible), len(job.poses))
         write_lists(folder, job.stamps, job.poses)
         write_camera(folder / "camera.yaml", job.camera)
@@ -156,8 +156,8 @@ def _check(config: RenderConfig) -> None:
     if config.name not in SCENES:
         known = f"{', '.join(SCENES)}{did_you_mean(config.name, SCENES)}"
         raise InputError(f"scene {config.name!r} is unknown; choose one of {known}")
-    for name in ("frames", "rounds"):
-        if (number := getattr(config, name)) is not None and number < 1:
+    for name, number in (("frames", config.frames), ("rounds", config.rounds)):
+        if number is not None and number < 1:
             raise InputError(f"{name}={number}: must be at least 1")
     if config.rounds > 1 and config.name not in CLOSED:
         raise InputError(
@@ -246,7 +246,7 @@ def _built(
     return boxes, cast, scene, markers
 
 
-def _draw_all(job: _Job) -> Iterator[list[VisibleInstance]]:
+def _draw_all(job: _Job) -> Generator[list[VisibleInstance], None, None]:
     """Draw and write frames on worker threads; annotations come in order."""
     waiting: deque[Future[list[VisibleInstance]]] = deque()
     with ThreadPoolExecutor(_WORKERS) as pool:

@@ -16,6 +16,7 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import quaternion_from_rotation
 from bmask_slam.graph.whole_file import whole_folder, writing
+from bmask_slam.semantics.instances.image_files import write_image
 
 _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
@@ -41,10 +42,7 @@ def new_folder(out: Path) -> Iterator[Path]:
 def write_png(path: Path, picture: NDArray[Any]) -> None:
     """Write 8-bit RGB (H, W, 3) or 16-bit grey (H, W); missing folders are made."""
     path.parent.mkdir(exist_ok=True)
-    if picture.ndim == 3:
-        picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-    if not cv2.imwrite(str(path), picture, _FAST_PNG):
-        raise OSError(f"{path}: could not be written")
+    write_image(path, picture, _FAST_PNG)
 
 
 def stored_depth(depth_m: NDArray[np.floating], scale: float) -> NDArray[np.uint16]:

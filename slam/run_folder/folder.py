@@ -258,7 +258,7 @@ def _clear(path: Path, overwrite: bool) -> None:
             "--overwrite"
         )
     with writing(path, ELSEWHERE):
-        if FRAMES in held:
+        if (path / FRAMES).is_file():
             with (path / FRAMES).open("rb") as file:
                 lock_file(file, path)
         _remove(path, [*held, *(old.name for old in path.glob(OF_MERGED_RUNS) if held)])

@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 
 from tqdm import tqdm
 
+from bmask_slam.graph.errors import one_line
 from bmask_slam.tracking.results import TrackingStatus
 
 tqdm.set_lock(threading.RLock())  # its own is for processes, and may start one
@@ -100,7 +101,7 @@ class _BarHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         with suppress(OSError):
-            tqdm.write(self.format(record), file=sys.stderr)
+            tqdm.write(one_line(self.format(record)), file=sys.stderr)
 
 
 @contextmanager

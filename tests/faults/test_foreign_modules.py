@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 import urllib.request
@@ -12,7 +13,9 @@ import pytest
 
 from bmask_slam.comparison.experiment.result import CellStatus
 from bmask_slam.comparison.jobs.job import Job, run_job
+from bmask_slam.doctor.cameras import ask_libraries
 
+ROOT = Path(__file__).parents[2]
 NAMES = (
     *("queue", "json", "csv", "socket", "pickle", "zipfile", "threading", "signal", "ctypes"),
     *("numpy", "cv2", "torch", "gtsam", "ray", "tqdm", "rerun", "usercustomize", "sitecustomize"),
@@ -39,6 +42,26 @@ def test_live_and_its_processes(office: Path, hostile: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
     assert (hostile / "run" / "trajectory.txt").is_file()
+
+
+def test_the_libraries_that_doctor_asks(hostile: Path) -> None:
+    (asked,) = ask_libraries(["cv2"])
+    assert not asked.error or "OpenNI" in asked.error  # it was asked, and answered
+
+
+def test_every_process_of_this_python_is_started_without_the_current_folder() -> None:
+    """``-P`` comes right after the interpreter, wherever one is started."""
+    started, parts = 0, [ROOT / part for part in ("slam", "graph", "semantics", "mapping")]
+    for file in (file for part in parts for file in part.rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.List) and node.elts and is_interpreter(node.elts[0]):
+                started += 1
+                assert ast.unparse(node.elts[1]) == "'-P'", f"{file}:{node.lineno}"
+    assert started >= 8
+
+
+def is_interpreter(node: ast.expr) -> bool:
+    return isinstance(node, ast.Attribute) and ast.unparse(node) == "sys.executable"
 
 
 def test_jobs_of_compare(hostile: Path) -> None:

@@ -18,6 +18,7 @@ import pytest
 from bmask_slam.config.configuration import resolve
 from bmask_slam.datasets.unpack import unpack
 from bmask_slam.dense.folder import DenseFolder
+from bmask_slam.dense.map_run import remove_stored_frames
 from bmask_slam.evaluation import frame_stamps
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files import reading
@@ -29,6 +30,7 @@ from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.graph.trajectory_formats import read_euroc, read_trajectory
 from bmask_slam.mapping.inverse_depth.depth_map import DEPTH_FILE, read_depth_map
 from bmask_slam.mapping.products.submaps import SUBMAP_FILE, read_submap
+from bmask_slam.run_folder.folder import RunFolder
 from bmask_slam.run_folder.frame_file import read_frames
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.run_folder.semantic_files import read_labels, read_objects
@@ -36,6 +38,7 @@ from bmask_slam.semantics.beliefs.movability import read_priors
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.labels import read_label_set
 from bmask_slam.semantics.weights.checkpoints import load_network
+from bmask_slam.sequences.bags.bag_file import open_bag
 from bmask_slam.sequences.cameras import read_camera
 from bmask_slam.sequences.lists import read_list
 from bmask_slam.system_config import SystemConfig
@@ -164,11 +167,32 @@ def test_a_hostile_file_is_one_clear_error(
     assert name in str(caught.value) or "settings.json" in str(caught.value)
 
 
-@pytest.mark.parametrize("reader", [read_tum, read_list, read_yaml, read_colour, read_camera])
-def test_a_pipe_is_not_waited_for(tmp_path: Path, reader: Callable[[Path], Any]) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(InputError, match=r"no plain file|no such"):
-        reader(tmp_path / "pipe")
+def read_bag(path: Path) -> None:
+    with open_bag(path):
+        pass
+
+
+def unpack_beside(path: Path) -> None:
+    unpack(path, path.parent / "unpacked")
+
+
+@pytest.mark.parametrize(
+    "reader",
+    [read_tum, read_list, read_yaml, read_colour, read_camera, read_bag, unpack_beside],
+)
+@pytest.mark.parametrize("name", ["pipe", "pipe.bag", "pipe.mcap", "pipe.db3"])
+def test_a_pipe_is_not_waited_for(tmp_path: Path, reader: Callable[[Path], Any], name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(InputError, match=r"no plain file|no such|is no file"):
+        reader(tmp_path / name)
+
+
+def test_a_pipe_in_a_run_folder_is_not_waited_for(tmp_path: Path) -> None:
+    (tmp_path / "dense").mkdir()
+    os.mkfifo(tmp_path / "frames.csv")
+    remove_stored_frames(tmp_path, tmp_path / "dense")
+    with RunFolder(tmp_path, overwrite=True):
+        assert not (tmp_path / "frames.csv").is_fifo()
 
 
 # --- arrays --------------------------------------------------------------------------------------

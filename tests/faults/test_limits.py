@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import re
 import resource
@@ -22,6 +23,7 @@ from bmask_slam import cli
 from bmask_slam.graph.errors import InputError
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.run_folder.folder import RunFolder
+from bmask_slam.runtime.progress import console_log
 
 COMMAND = [sys.executable, "-m", "bmask_slam"]
 
@@ -72,15 +74,16 @@ def test_a_bug_before_the_first_frame_leaves_the_log(tmp_path: Path) -> None:
     assert "ZeroDivisionError: a bug" in (tmp_path / "run" / "log.txt").read_text()
 
 
-def test_too_few_descriptors(office: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("command", "limit"), [("live", 16), ("run", 12), ("run", 10)])
+def test_too_few_descriptors(office: Path, tmp_path: Path, command: str, limit: int) -> None:
     out = tmp_path / "a" / "run"
-    words = ["live", str(office), "--segmenter", "none", "--out", str(out)]
-    code, errors = limited("-n 16", words)
+    words = [command, str(office), "--segmenter", "none", "--out", str(out)]
+    code, errors = limited(f"-n {limit}", words)
     assert code == 1
     lines = [line for line in errors.splitlines() if line.startswith("error: ")]
     assert len(lines) == 1 and lines[0].endswith("raise the limit of open files: ulimit -n 4096")
     assert "Traceback" not in errors
-    assert not out.parent.exists()
+    assert not out.parent.exists() or (out / "trajectory.txt").is_file()  # all that was tracked
 
 
 @contextmanager
@@ -101,6 +104,33 @@ def test_a_disk_that_is_full_from_the_beginning(tmp_path: Path, size: int) -> No
     with pytest.raises(InputError, match="File too large"), no_file_larger_than(size):
         run(RunOptions(sequence, out=out, quiet=True), FakeSystem)
     assert not out.parent.exists()
+
+
+@pytest.mark.parametrize("words", [("convert", "seq", "out"), ("segment", "seq", "--out", "out")])
+def test_images_that_do_not_fit_on_the_disk(
+    tmp_path: Path, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """OpenCV's own writer leaves the half of an image and says nothing."""
+    make_sequence(tmp_path / "seq")
+    given = [str(tmp_path / word) if word in ("seq", "out") else word for word in words]
+    more = ["--segmenter", "none"] if "segment" in words else []
+    with no_file_larger_than(60):
+        assert cli.main([*given, *more]) == 1
+    assert re.search("error: .*File too large; free some", capsys.readouterr().err)
+    assert not list((tmp_path / "out").rglob("*.png"))
+
+
+def test_a_line_is_short_whatever_the_name(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of errors, of wrong words of a command, and of warnings."""
+    long = "x" * 3000
+    assert cli.main(["info", f"/{long}"]) == 1
+    with pytest.raises(SystemExit):
+        cli.main(["run", "a", f"--{long}"])
+    with console_log():
+        logging.getLogger("bmask_slam").warning("%s: left out", long)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) >= 3
+    assert max(map(len, lines)) <= 500
 
 
 def test_a_file_system_that_is_full_from_the_beginning(small_disk: Path) -> None:

@@ -16,6 +16,7 @@ from bmask_slam.comparison.experiment.provenance import (
     rendered_hash,
 )
 from bmask_slam.comparison.jobs.job import Job
+from bmask_slam.graph.files.file_names import plain_path
 from bmask_slam.rendering.sequence import RenderConfig
 
 SEQUENCES, CELLS = "sequences", "cells"
@@ -67,7 +68,7 @@ def rendered_sequence(
 ) -> SequenceData:
     """A rendered sequence with its job; ``config`` without the seed."""
     seeded = replace(config, seed=seed, true_depth=True)
-    folder = out / SEQUENCES / f"{slug(source.name)}-{seed}"
+    folder = plain_path(out, f"{SEQUENCES}/{slug(source.name)}-{seed}")
     contents = rendered_hash(seeded)
     path = str(folder)
     job = Job(
@@ -75,7 +76,7 @@ def rendered_sequence(
         f"rendering {source.name}",
         ("render", config.name, *_render_arguments(seeded), "--out", path, "--quiet"),
         product=str(folder / "groundtruth.txt"),
-        record=f"{path}.record/record.json",
+        record=str(plain_path(out, f"{SEQUENCES}/{folder.name}.record/record.json")),
         log=f"{path}.record/log.txt",
         depends={"sequence": contents},
         clear=path,
@@ -114,8 +115,8 @@ def run_jobs(
 
 def _run_job(data: SequenceData, key: CellKey, configuration: Configuration, out: Path) -> Job:
     source, name, seed = data.source, key.configuration, key.seed
-    folder = out / CELLS / slug(source.name) / slug(name) / str(seed)
-    run = folder / "run"
+    run = plain_path(out, f"{CELLS}/{slug(source.name)}/{slug(name)}/{seed}/run")
+    folder = run.parent
     setting = SEED_SETTING.format(seed)
     words = ["run", str(data.folder), "--out", str(run), "--quiet", "--overwrite"]
     words += [*configuration.arguments(), "--set", setting]

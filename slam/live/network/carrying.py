@@ -20,7 +20,9 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.graph.arrays import Bytes
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import read_bytes
+from bmask_slam.graph.whole_file import open_plain
 from bmask_slam.live.channel import END, Channel
 from bmask_slam.live.messages import Finish, MapSaved, SaveMap, SaveState, StateSaved
 
@@ -113,19 +115,19 @@ class CarriedFiles:
             self._channel.send(FilePiece(path, begin, data[begin:end], last))
 
 
-def store(piece: FilePiece, fail: Callable[[OSError], Any]) -> Any | None:
+def store(piece: FilePiece, fail: Callable[[OSError | InputError], Any]) -> Any | None:
     """Write a piece; returns the message of the last, when the file has its name.
 
     What cannot be written is what ``fail`` makes of the message.
     """
     part = piece.path.with_name(f"{piece.path.name}.part")
     try:
-        with part.open("r+b" if piece.begin else "wb") as file:
+        with open_plain(part, "r+b" if piece.begin else "wb") as file:
             file.seek(piece.begin)
             file.write(piece.data.tobytes())
         if piece.message is not None:
             os.replace(part, piece.path)
-    except OSError as error:
+    except (OSError, InputError) as error:
         with suppress(OSError):  # without its beginning, no later piece makes a file of it
             part.unlink()
         return fail(error) if piece.message is not None else None

@@ -185,8 +185,8 @@ class DistantEnd:
                 return found
 
     def _stored(self, piece: FilePiece) -> Any | None:
-        def fail(error: OSError) -> Any | None:
-            logger.warning("%s: cannot be written (%s)", piece.path, error.strerror)
+        def fail(error: OSError | InputError) -> Any | None:
+            logger.warning("%s: cannot be written (%s)", piece.path, error)
             is_map = isinstance(piece.message, MapSaved)
             return replace(piece.message, failure=str(error)) if is_map else None
 

@@ -92,8 +92,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
     Raises:
         InputError: no such bag, one that cannot be read, or rosbags is not installed.
     """
-    if not path.exists():
-        raise InputError(f"{path}: no such bag")
+    if not (path.is_file() or path.is_dir()):
+        reason = "is no file or folder" if path.exists() else "no such bag"
+        raise InputError(f"{path}: {reason}; give a .bag, .mcap or .db3, or the folder of a bag")
     typesys = import_extra("rosbags.typesys", str(path), "ros")
     highlevel = import_extra("rosbags.highlevel", str(path), "ros")
     allowance = Allowance(path)

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from bmask_slam.graph.errors import InputError
@@ -16,6 +15,7 @@ from bmask_slam.graph.files.reading import MAX_TEXT_BYTES, read_bytes
 from bmask_slam.graph.sensors.streams import FILES
 from bmask_slam.graph.trajectory import write_tum
 from bmask_slam.graph.whole_file import whole_folder
+from bmask_slam.semantics.instances.image_files import write_image
 from bmask_slam.sequences.cameras import write_camera
 from bmask_slam.sequences.formats.layouts import open_recording
 from bmask_slam.sequences.lists import IMAGE_SUFFIXES, ImageList
@@ -151,7 +151,7 @@ class _Images:
         if suffix in IMAGE_SUFFIXES and file.is_file():
             shutil.copyfile(file, self._out / f"{stem}{suffix}")
             return f"{stem}{suffix}"
-        cv2.imwrite(str(self._out / f"{stem}.png"), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+        write_image(self._out / f"{stem}.png", rgb)
         return f"{stem}.png"
 
     def _depth(self, file: Path, stem: str) -> str:
@@ -160,5 +160,5 @@ class _Images:
         values = np.nan_to_num(np.rint(stored * self.factor), nan=0.0, posinf=0.0, neginf=0.0)
         self._written.too_far += int(np.count_nonzero(values > MAX_STORED))
         values = np.where((values > 0) & (values <= MAX_STORED), values, 0).astype(np.uint16)
-        cv2.imwrite(str(self._out / f"{stem}.png"), values)
+        write_image(self._out / f"{stem}.png", values)
         return f"{stem}.png"

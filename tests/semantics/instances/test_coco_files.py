@@ -14,7 +14,9 @@ from pycocotools import mask as coco_mask
 from repository import shared
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.semantics.instances.coco_files import decoded_lengths, read_coco
+from bmask_slam.semantics.instances import coco_files
+from bmask_slam.semantics.instances.coco_files import read_coco
+from bmask_slam.semantics.instances.run_lengths import decoded_lengths
 
 SQUARE = [2.0, 3.0, 6.0, 3.0, 6.0, 9.0, 2.0, 9.0]
 
@@ -87,6 +89,28 @@ def test_a_broken_object_is_reported_and_the_others_are_used(
     assert "annotation 3" in content.problems[-1]
     assert words in content.problems[-1]
     assert "c.json" in caplog.text
+
+
+def test_many_long_polygons_take_no_minutes(tmp_path: Path) -> None:
+    """Each of 100 bytes took half a second and 100 MB; real ones are never so long."""
+    around = [[-2e6, -2e6, 1e6, -2e6, 1e6, 1e6]]
+    path = write(tmp_path / "c.json", [annotation(segmentation=around)] * 40 + [annotation()])
+    content = read_coco(path)
+    assert [problem.partition(": ")[2] for problem in content.problems] == [
+        "segmentation: the edges of the file's polygons are too long; left out"
+    ] * len(content.problems)
+    assert len(content.problems) >= 38
+    assert content.images[0].objects[-1].mask().sum() == 24
+
+
+def test_masks_of_an_image_take_no_gigabytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(coco_files, "MAX_MASK_BYTES", 3 * 12 * 10)
+    content = read_coco(write(tmp_path / "c.json", [annotation()] * 5))
+    assert len(content.images[0].objects) == 3
+    assert len(content.problems) == 2
+    assert "image 7 has 3 objects, which is the limit of its size" in content.problems[0]
 
 
 def test_the_good_polygons_of_an_object_are_used(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.semantics.instances.image_files import LIMIT, decode_bytes, read_colour
+from bmask_slam.semantics.instances.image_files import LIMIT, decode_bytes, read_colour, write_image
 
 
 def png_header(width: int, height: int) -> bytes:
@@ -30,8 +30,20 @@ def png_header(width: int, height: int) -> bytes:
 def test_a_huge_size_is_refused_before_decoding(tmp_path: Path, width: int, height: int) -> None:
     path = tmp_path / "bomb.png"
     path.write_bytes(png_header(width, height))
-    with pytest.raises(InputError, match=r"bomb\.png: .* more than 100 megapixels"):
+    size = f"{width} x {height} pixels"
+    with pytest.raises(InputError, match=rf"bomb\.png: {size}, more than 100 megapixels"):
         read_colour(path)
+
+
+@pytest.mark.parametrize("length", [0x7FFFFFFF, 0xFFFFFFF0, 40])
+def test_a_chunk_is_no_longer_than_the_file(monkeypatch: pytest.MonkeyPatch, length: int) -> None:
+    """Of the length that the first chunk of pixels states OpenCV took 4 GB, for 69 bytes."""
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    whole = png_header(4, 4)
+    at = whole.index(b"IDAT")
+    data = whole[: at - 4] + struct.pack(">I", length) + whole[at:]
+    with pytest.raises(InputError, match="a: not a readable image"):
+        decode_bytes(data, cv2.IMREAD_COLOR, "a")
 
 
 def test_another_limit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -40,6 +52,25 @@ def test_another_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(LIMIT, "0.1")
     with pytest.raises(InputError, match=r"400 x 300 pixels, more than 0\.1 megapixels"):
         decode_bytes(data, cv2.IMREAD_COLOR, "a")
+
+
+@pytest.mark.parametrize("limit", ["abc", "nan", "inf", "0", "-1"])
+def test_a_limit_that_is_none(monkeypatch: pytest.MonkeyPatch, limit: str) -> None:
+    monkeypatch.setenv(LIMIT, limit)
+    with pytest.raises(InputError, match=f"{LIMIT}={limit}: is no positive number"):
+        decode_bytes(png_header(4, 4), cv2.IMREAD_COLOR, "a")
+
+
+def test_what_is_written_is_read_or_the_disk_is_full(tmp_path: Path) -> None:
+    rgb = np.random.default_rng(0).integers(0, 255, (30, 40, 3), np.uint8)
+    depth = rgb[..., 0].astype(np.uint16) * 200
+    for name, picture in (("a.png", rgb), ("b.png", depth)):
+        write_image(tmp_path / name, picture)
+    np.testing.assert_array_equal(read_colour(tmp_path / "a.png"), rgb)
+    read = decode_bytes((tmp_path / "b.png").read_bytes(), cv2.IMREAD_UNCHANGED, "b")
+    np.testing.assert_array_equal(read, depth)
+    with pytest.raises(OSError, match="No such file"):
+        write_image(tmp_path / "nowhere" / "a.png", rgb)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tiff", ".webp", ".ppm"])

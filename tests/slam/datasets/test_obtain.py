@@ -87,6 +87,21 @@ def test_a_tum_archive_becomes_a_sequence(server, tmp_path):
     assert len(server.requests) == 1
 
 
+def test_nothing_is_unpacked_through_a_link(server, tmp_path):
+    """Nor is what a killed download left behind kept, under a name that could be guessed."""
+    (tmp_path / "tum" / ".freiburg1_tiny.unpacking-killed").mkdir(parents=True)
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    for name in (".freiburg1_tiny.unpacking", ".freiburg1_tiny.unpacking-a"):
+        (tmp_path / "tum" / name).symlink_to(victim)
+    folder = obtain(Recording("tum/freiburg1_tiny", f"{server.url}/tiny.tgz"), tmp_path)
+    assert (folder / "rgb.txt").is_file() and not folder.is_symlink()
+    assert not list(victim.iterdir())
+    assert (folder.stat().st_mode & 0o777) == (victim.stat().st_mode & 0o777)
+    names = sorted(path.name for path in folder.parent.iterdir())
+    assert names == [".freiburg1_tiny.unpacking", "freiburg1_tiny"]
+
+
 def test_the_first_hash_is_kept_and_a_later_file_must_agree(server, tmp_path, caplog):
     recording = Recording("tum/freiburg1_tiny", f"{server.url}/tiny.tgz")
     folder = obtain(recording, tmp_path, keep_archive=True)
