@@ -91,7 +91,7 @@ def hang(path: Path) -> None:
 
 
 def large(path: Path) -> None:
-    bytes(3 << 30)
+    bytes(8 << 30)
 
 
 def escape(path: Path) -> None:
@@ -115,6 +115,18 @@ def test_the_engine_sees(
     assert (words in "".join(count.faults)) and bool(count.faults) == bool(words)
     assert count.faulty == (3 if words else 0)
     assert bool(words) == (tmp_path / "kept").is_dir()
+
+
+def test_the_engine_sees_memory_that_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where a library hides that it could not have more."""
+    monkeypatch.setenv("FUZZ_OUT", str(tmp_path / "kept"))
+    monkeypatch.setattr("engine.MAX_BYTES", 50 << 20)
+    reader = Reader("a", "a.txt", lambda path: b"1" * (100 << 20), (b"abc",))
+    count = fuzz(reader, tmp_path, 3, 20.0)
+    assert list(count.faults) == ["memory"]
+    assert (count.inputs, count.faulty, count.accepted) == (3, 1, 2)
 
 
 def test_the_same_seed_gives_the_same_inputs(tmp_path: Path) -> None:

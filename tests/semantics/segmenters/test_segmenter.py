@@ -206,6 +206,17 @@ def test_label_images_of_any_tool(tmp_path: Path) -> None:
         LabelImageSegmenter(tmp_path, LABELS).segment(image, "b.png")
 
 
+def test_a_label_image_of_a_thousand_objects_takes_no_gigabytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = "bmask_slam.semantics.segmenters.segmenter"
+    monkeypatch.setattr(f"{module}.MAX_MASK_BYTES", 4 * 40 * 60)
+    values = np.arange(40 * 60).reshape(40, 60) % 6
+    cv2.imwrite(str(tmp_path / "a.png"), values.astype(np.uint8))
+    with pytest.raises(InputError, match=r"a\.png: 5 different values, masks of more than"):
+        LabelImageSegmenter(tmp_path, LABELS).segment(np.zeros((40, 60, 3), np.uint8), "a.png")
+
+
 @pytest.mark.parametrize(
     "image",
     [
