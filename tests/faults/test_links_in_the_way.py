@@ -17,6 +17,7 @@ from bmask_slam.comparison.jobs.cells import rendered_sequence, run_jobs
 from bmask_slam.comparison.jobs.job import Job, run_job
 from bmask_slam.comparison.optimise_folder import FolderOptions, optimise_folder
 from bmask_slam.comparison.report.report import write_report
+from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import file_stem
 from bmask_slam.graph.whole_file import open_plain
@@ -122,6 +123,19 @@ def test_a_file_that_comes_over_the_network(tmp_path: Path) -> None:
     store(FilePiece(tmp_path / "map", 0, np.zeros(4, np.uint8), "saved"), failed.append)
     assert "map.part: is a link" in str(failed[0])
     assert (tmp_path / "victim").read_text() == KEPT
+
+
+@pytest.mark.parametrize("name", ["dense", "dense/depth"])
+def test_a_dense_map_that_is_a_link(tmp_path: Path, name: str) -> None:
+    """A map with other settings would remove what it leads to."""
+    victim, run = tmp_path / "victim", tmp_path / "run"
+    victim.mkdir()
+    (victim / "settings.json").write_text("{}")
+    (run / name).parent.mkdir(parents=True)
+    (run / name).symlink_to(victim)
+    with pytest.raises(InputError, match=f"{name}: is a link"):
+        DenseFolder(run, {"other": 1})
+    assert [path.name for path in victim.iterdir()] == ["settings.json"]
 
 
 def test_a_folder_of_figures_that_is_a_link(tmp_path: Path) -> None:
