@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
@@ -109,7 +110,7 @@ def find_topics(bag: Bag, requested: BagTopics) -> BagTopics:
         rgb, depth = requested.rgb or rgb, requested.depth or depth  # noqa: PLW2901
         found = _form_of(rgb, images), _form_of(depth, images)
         if all(found):
-            return BagTopics(*found, requested.camera_info or _info_topic(rgb))
+            return BagTopics(*found, requested.camera_info or _info_topic(bag, rgb))
     raise InputError(
         f"{bag.path}: no images on the topics of any camera that is known; give --rgb-topic and "
         f"--depth-topic, of: {listed}"
@@ -122,12 +123,15 @@ def _form_of(wish: str, images: list[str]) -> str:
     return next((name for name in forms if name in images), "")
 
 
-def _info_topic(topic: str) -> str:
-    """The camera_info topic of an image topic, where image_transport or RealSense's SDK puts it."""
+def _info_topic(bag: Bag, topic: str) -> str:
+    """The camera_info topic of an image topic: beside it, or where RealSense's SDK has it in ROS 1.
+
+    Of the two the one that the bag has.
+    """
     base = topic.removesuffix("/compressed").removesuffix("/compressedDepth")
-    if base.endswith("/image/data"):
-        return f"{base.removesuffix('/image/data')}/info/camera_info"
-    return f"{base.rpartition('/')[0]}/camera_info"
+    beside = f"{base.rpartition('/')[0]}/camera_info"
+    sdk = f"{base.removesuffix('/image/data')}/info/camera_info"
+    return sdk if base.endswith("/image/data") and beside not in _infos(bag) else beside
 
 
 def find_camera(
@@ -161,8 +165,11 @@ def _depth_scale(bag: Bag, depth: Any, topic: str) -> float:
     """Stored depth of one metre: by the encoding, or by the unit that RealSense's SDK records."""
     scale = DEPTH_SCALES[depth_encoding(depth, topic)]
     for _, unit in bag.messages(_SDK_UNITS):
-        unit_m = float(getattr(unit, "data", 0.0))
-        return 1 / unit_m if 1e-6 <= unit_m <= 1 else scale
+        with suppress(TypeError, ValueError):
+            unit_m = float(getattr(unit, "data", 0.0))  # a number in ROS 1, its text in ROS 2
+            return 1 / unit_m if 1e-6 <= unit_m <= 1 else scale
+        logger.warning("%s: %s is no number; depth is taken in 1/%g m", bag.path, _SDK_UNITS, scale)
+        break
     return scale
 
 
@@ -177,9 +184,10 @@ def _depth_form(bag: Bag, topics: BagTopics, rgb_frame: str, depth_frame: str) -
     sdk = topics.depth.startswith(_SDK_DEPTH)
     if not sdk and (rgb_frame == depth_frame or any(word in topics.depth for word in REGISTERED)):
         return DepthForm()
-    known = (_SDK_COLOUR, _SDK_DEPTH) if sdk else (rgb_frame, depth_frame)
-    T_colour_depth = _sdk_extrinsics(bag) if sdk else static_extrinsics(bag, *known)
-    info = _info_topic(topics.depth)
+    T_colour_depth = _sdk_extrinsics(bag) if sdk else None
+    if T_colour_depth is None and rgb_frame != depth_frame:
+        T_colour_depth = static_extrinsics(bag, rgb_frame, depth_frame)
+    info = _info_topic(bag, topics.depth)
     if T_colour_depth is None or info not in _infos(bag):
         logger.warning(
             "%s: colour is in the frame %r, depth in %r, and the bag does not tell where they are; "
@@ -193,7 +201,10 @@ def _depth_form(bag: Bag, topics: BagTopics, rgb_frame: str, depth_frame: str) -
 
 
 def _sdk_extrinsics(bag: Bag) -> Array | None:
-    """T_colour_depth by the transforms of RealSense's SDK, each T_stream_reference."""
+    """T_colour_depth by what RealSense's SDK has in ROS 1, each T_stream_reference; None: no such.
+
+    In ROS 2 it has frames of the streams in /tf_static.
+    """
     poses = []
     for stream in (_SDK_COLOUR, _SDK_DEPTH):
         message = next((m for _, m in bag.messages(f"{stream}tf/0")), None)
