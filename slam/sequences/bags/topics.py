@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import inverse, make_pose, rotation_from_quaternion
 from bmask_slam.sequences.bags.bag_file import IMAGE_TYPES, INFO_TYPE, Bag
+from bmask_slam.sequences.bags.extrinsics import sdk_extrinsics, static_extrinsics
 from bmask_slam.sequences.bags.ros_images import (
     DEPTH_SCALES,
     camera_of,
@@ -26,6 +22,7 @@ from bmask_slam.sequences.bags.ros_images import (
 from bmask_slam.sequences.camera_presets import is_preset
 from bmask_slam.sequences.cameras import given_camera, read_camera
 from bmask_slam.sequences.checks import check_depth_scale, check_sizes
+from bmask_slam.sequences.images import Lens
 from bmask_slam.sequences.recording import DepthForm
 
 logger = logging.getLogger(__name__)
@@ -41,9 +38,6 @@ _FIELDS = {
 _SDK = "/device_0/sensor_{}/{}_0/"
 _SDK_COLOUR, _SDK_DEPTH = _SDK.format(1, "Color"), _SDK.format(0, "Depth")
 _SDK_UNITS = "/device_0/sensor_0/option/Depth_Units/value"
-TRANSFORMS = "/tf_static"
-MAX_STATIC = 100
-"""Messages of /tf_static that are read; there is one for each node that knows a transform."""
 
 
 @dataclass(frozen=True)
@@ -134,31 +128,45 @@ def _info_topic(bag: Bag, topic: str) -> str:
     return sdk if base.endswith("/image/data") and beside not in _infos(bag) else beside
 
 
-def find_camera(
-    bag: Bag, topics: BagTopics, given: Path | Camera | None
-) -> tuple[Camera, DepthForm]:
+class BagCamera(NamedTuple):
+    """The camera of a bag's colour images, once its ``lens`` has undistorted them if it has one.
+
+    ``form`` is what the values of its depth images mean.
+    """
+
+    camera: Camera
+    form: DepthForm
+    lens: Lens | None
+
+
+def find_camera(bag: Bag, topics: BagTopics, given: Path | Camera | None) -> BagCamera:
     """The given camera, or that of the camera_info, and what depth values mean.
 
     Depth of another frame is registered by the camera_info beside it and by /tf_static, or by the
-    extrinsics that RealSense's SDK records.
+    extrinsics that RealSense's SDK records. Images of a lens that no camera describes are
+    undistorted, unless the given camera is of those as recorded (``Lens.is_of_recorded``).
 
     Raises:
         InputError: no usable intrinsics, or images of another size.
     """
     rgb, depth = first_message(bag, topics.rgb), first_message(bag, topics.depth)
     scale = _depth_scale(bag, depth, topics.depth)
-    if isinstance(given, Camera):
-        camera = given
-    elif given is not None and not is_preset(given):
-        camera = read_camera(given)
-        check_depth_scale(camera, scale, str(given), f"{bag.path}'s depth")
+    if given is None or is_preset(given):
+        own, lens = _camera_of(bag, topics.rgb, topics.camera_info, scale)
+        camera = own if given is None else given_camera(given, own)
     else:
-        camera = _camera_of(bag, topics.rgb, topics.camera_info, scale)
-        camera = camera if given is None else given_camera(given, camera)
+        camera, lens = given if isinstance(given, Camera) else read_camera(given), None
+        if not isinstance(given, Camera):
+            check_depth_scale(camera, scale, str(given), f"{bag.path}'s depth")
+        with suppress(InputError):  # a camera_info is not needed
+            lens = _camera_of(bag, topics.rgb, topics.camera_info, scale)[1]
     form = _depth_form(bag, topics, rgb.header.frame_id, depth.header.frame_id)
     images = colour_image(rgb, topics.rgb), depth_image(depth, topics.depth)
     check_sizes(*images, camera, f"{bag.path}: {topics.rgb} and {topics.depth}", form.camera)
-    return camera, form
+    if lens is None or lens.is_of_recorded(camera):
+        return BagCamera(camera, form, None)
+    logger.info("%s: images are undistorted by the lens of %s", bag.path, topics.camera_info)
+    return BagCamera(camera, form if form.camera else replace(form, lens=lens), lens)
 
 
 def _depth_scale(bag: Bag, depth: Any, topic: str) -> float:
@@ -173,8 +181,8 @@ def _depth_scale(bag: Bag, depth: Any, topic: str) -> float:
     return scale
 
 
-def _camera_of(bag: Bag, topic: str, info: str, scale: float) -> Camera:
-    """The camera of an image topic by its camera_info. Raises InputError."""
+def _camera_of(bag: Bag, topic: str, info: str, scale: float) -> tuple[Camera, Lens | None]:
+    """The camera of an image topic by its camera_info, and its lens. Raises InputError."""
     rectified = "_rect" in topic.removesuffix("/compressed").rpartition("/")[2]
     return camera_of(_camera_info(bag, info), scale, rectified, f"{bag.path}: {info}")
 
@@ -184,7 +192,7 @@ def _depth_form(bag: Bag, topics: BagTopics, rgb_frame: str, depth_frame: str) -
     sdk = topics.depth.startswith(_SDK_DEPTH)
     if not sdk and (rgb_frame == depth_frame or any(word in topics.depth for word in REGISTERED)):
         return DepthForm()
-    T_colour_depth = _sdk_extrinsics(bag) if sdk else None
+    T_colour_depth = sdk_extrinsics(bag, _SDK_COLOUR, _SDK_DEPTH) if sdk else None
     if T_colour_depth is None and rgb_frame != depth_frame:
         T_colour_depth = static_extrinsics(bag, rgb_frame, depth_frame)
     info = _info_topic(bag, topics.depth)
@@ -194,58 +202,10 @@ def _depth_form(bag: Bag, topics: BagTopics, rgb_frame: str, depth_frame: str) -
             "depth must be registered to colour", bag.path, rgb_frame, depth_frame,
         )  # fmt: skip
         return DepthForm()
-    camera = _camera_of(bag, topics.depth, info, 1.0)
+    camera, lens = _camera_of(bag, topics.depth, info, 1.0)
     moved_mm = 1e3 * T_colour_depth[:3, 3]
     logger.info("%s: depth is registered, its camera is %s mm beside colour's", bag.path, moved_mm)
-    return DepthForm(camera=camera, T_colour_depth=T_colour_depth)
-
-
-def _sdk_extrinsics(bag: Bag) -> Array | None:
-    """T_colour_depth by what RealSense's SDK has in ROS 1, each T_stream_reference; None: no such.
-
-    In ROS 2 it has frames of the streams in /tf_static.
-    """
-    poses = []
-    for stream in (_SDK_COLOUR, _SDK_DEPTH):
-        message = next((m for _, m in bag.messages(f"{stream}tf/0")), None)
-        if message is None or not hasattr(message, "rotation"):
-            return None
-        poses.append(_pose_of(message, bag))
-    return poses[0] @ inverse(poses[1])
-
-
-def static_extrinsics(bag: Bag, rgb_frame: str, depth_frame: str) -> Array | None:
-    """T_rgb_depth of two frames by /tf_static; None if its tree does not hold both."""
-    parents: dict[str, tuple[str, Array]] = {}
-    for count, (_, message) in enumerate(bag.messages(TRANSFORMS)):
-        if count == MAX_STATIC or not hasattr(message, "transforms"):
-            break
-        for one in message.transforms:
-            parent, child = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
-            parents[child] = parent, _pose_of(one.transform, bag)
-    rgb, depth = (dict(_upwards(f.lstrip("/"), parents)) for f in (rgb_frame, depth_frame))
-    shared = next((frame for frame in rgb if frame in depth), None)
-    return None if shared is None else inverse(rgb[shared]) @ depth[shared]
-
-
-def _upwards(frame: str, parents: dict[str, tuple[str, Array]]) -> Iterator[tuple[str, Array]]:
-    """A frame and those above it, each with T_it_frame; ends where a tree runs in a circle."""
-    T_here_frame = np.eye(4)
-    for _ in range(len(parents) + 1):
-        yield frame, T_here_frame
-        if frame not in parents:
-            return
-        frame, T_parent_here = parents[frame]
-        T_here_frame = T_parent_here @ T_here_frame
-
-
-def _pose_of(transform: Any, bag: Bag) -> Array:
-    """A geometry_msgs/Transform as (4, 4). Raises InputError for what is no pose."""
-    q, t = transform.rotation, transform.translation
-    words = np.array([q.x, q.y, q.z, q.w, t.x, t.y, t.z], float)
-    if not (np.isfinite(words).all() and 0.5 < np.linalg.norm(words[:4]) < 2):
-        raise InputError(f"{bag.path}: a transform of {words.tolist()} is no pose; give --camera F")
-    return make_pose(rotation_from_quaternion(words[:4]), words[4:])
+    return DepthForm(camera=camera, T_colour_depth=T_colour_depth, lens=lens)
 
 
 def _infos(bag: Bag) -> list[str]:
