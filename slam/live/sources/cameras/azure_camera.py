@@ -1,4 +1,4 @@
-"""Frames from an Azure Kinect, or from its recordings, by pyk4a; depth aligned to colour."""
+"""Frames from a connected Azure Kinect by pyk4a, depth aligned to colour; no recordings."""
 
 from __future__ import annotations
 
