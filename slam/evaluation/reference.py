@@ -90,10 +90,10 @@ def _read_truth_body(file: Path) -> TruthBody:
 
 def _pose(file: Path, name: str, numbers: object) -> Array:
     """The pose (4, 4) of 16 numbers. Raises InputError."""
-    is_list = isinstance(numbers, list) and len(numbers) == 16
-    if not is_list or not all(isinstance(n, int | float) for n in numbers):  # type: ignore[union-attr]
+    given = numbers if isinstance(numbers, list) else []
+    if len(given) != 16 or not all(isinstance(number, int | float) for number in given):
         raise InputError(f"{file}: {name} is not 16 numbers; {_CURE}")
-    T = np.array(numbers, float).reshape(4, 4)
+    T = np.array(given, float).reshape(4, 4)
     R = T[:3, :3]
     rigid = np.isfinite(T).all() and np.allclose(T[3], [0, 0, 0, 1])
     if not rigid or np.abs(R @ R.T - np.eye(3)).max() > MAX_SKEWNESS or np.linalg.det(R) < 0:

@@ -151,9 +151,10 @@ def find_camera(bag: Bag, topics: BagTopics, given: Path | Camera | None) -> Bag
     """
     rgb, depth = first_message(bag, topics.rgb), first_message(bag, topics.depth)
     scale = _depth_scale(bag, depth, topics.depth)
-    if given is None or is_preset(given):
+    preset = given if isinstance(given, Path) and is_preset(given) else None
+    if given is None or preset is not None:
         own, lens = _camera_of(bag, topics.rgb, topics.camera_info, scale)
-        camera = own if given is None else given_camera(given, own)
+        camera = own if preset is None else given_camera(preset, own)
     else:
         camera, lens = given if isinstance(given, Camera) else read_camera(given), None
         if not isinstance(given, Camera):
