@@ -60,9 +60,9 @@ _T_M = np.array(
     ]
 )
 BONN = TruthBody(_T_ROS @ orthonormalised(_T_M), _T_ROS)
-"""Of the Bonn RGB-D Dynamic dataset (Palazzolo et al., IROS 2019), as its page has them for its
-groundtruth.txt: T_ros T T_ros T_m, in the frame of its laser scan. T_m has a scale of 1.059, which
-is left out, as a pose has none."""
+"""Of the Bonn RGB-D Dynamic dataset (Palazzolo et al., IROS 2019): T_ros T T_ros T_m, in the frame
+of its laser scan, as in the loader of its own laboratory's PINGS (dataset/dataloaders/bonn.py). T_m
+has a scale of 1.059, which is left out, as a pose has none."""
 _BONN_FOLDER = re.compile(r"rgbd_bonn_\w+")
 
 
