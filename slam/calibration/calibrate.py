@@ -12,6 +12,7 @@ from bmask_slam.calibration.motion import landmark_motion
 from bmask_slam.calibration.priors import CalibrationPriors
 from bmask_slam.calibration.report import Calibrated, format_calibration, parameters_named
 from bmask_slam.calibration.views import SequenceDepths, connected_views, make_views
+from bmask_slam.evaluation.reference import read_reference
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.calibration.calibration import CalibrationResult, calibrate
 from bmask_slam.graph.calibration.model import (
@@ -29,7 +30,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.metrics import align
 from bmask_slam.graph.smoother.storage import read_graph
-from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, nearest_indices, read_tum
+from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, nearest_indices
 from bmask_slam.graph.whole_file import check_target
 from bmask_slam.run_folder.map_file import SavedRun, read_run
 from bmask_slam.run_folder.origin import find_sequence
@@ -190,13 +191,12 @@ def make_problem(
 
 def _reference_positions(path: Path, stamps_s: Array, poses: Array) -> tuple[Array, Array]:
     """Positions (K, 3) of a reference at stamps, NaN where it has none, and T_reference_world."""
-    file = path / "groundtruth.txt" if path.is_dir() else path
-    reference = read_tum(file)
+    reference = read_reference(path)
     at = nearest_indices(reference.timestamps_s, stamps_s)
     near = np.abs(reference.timestamps_s[at] - stamps_s) <= MAX_TIME_DIFFERENCE_S
     if near.sum() < MIN_REFERENCE_POSES:
         raise InputError(
-            f"{file}: has a pose within {MAX_TIME_DIFFERENCE_S:g} s for {near.sum()} keyframes; "
+            f"{path}: has a pose within {MAX_TIME_DIFFERENCE_S:g} s for {near.sum()} keyframes; "
             "give the reference of this sequence, in its clock"
         )
     positions = np.where(near[:, None], reference.positions_world[at], np.nan)

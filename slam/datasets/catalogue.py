@@ -17,7 +17,7 @@ from bmask_slam.graph.files.yaml_file import read_yaml
 
 CATALOGUE = "sequences.yaml"
 SHOWN = 5
-Layout = Literal["tum", "icl-nuim"]
+Layout = Literal["tum", "icl-nuim", "bonn"]
 STRICT = ConfigDict(strict=True, extra="forbid", frozen=True)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from bmask_slam.datasets.catalogue import Recording
 from bmask_slam.datasets.unpack import unpack
 from bmask_slam.datasets.web_file import WebFile, download
+from bmask_slam.evaluation.reference import BONN, TRUTH_BODY
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import target_below
 from bmask_slam.graph.files.reading import read_lines
@@ -126,6 +127,8 @@ def _completed(unpacked: Path, recording: Recording) -> Path:
         raise InputError(f"{recording.url}: the archive holds no {' or '.join(LISTS)}")
     if recording.layout == "icl-nuim":
         _icl_to_tum_layout(root)
+    if recording.layout == "bonn":
+        (root / TRUTH_BODY).write_text(BONN.yaml(), encoding="utf-8")
     if recording.camera and not (root / "camera.yaml").exists():
         text = format_yaml(recording.camera)
         (root / "camera.yaml").write_text(text, encoding="utf-8")

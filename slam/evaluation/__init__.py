@@ -8,8 +8,8 @@ from bmask_slam.evaluation.ate_rpe import (
     format_json,
     format_table,
     frame_stamps,
-    read_reference,
 )
+from bmask_slam.evaluation.reference import read_reference
 
 __all__ = [
     "EvaluationResult",

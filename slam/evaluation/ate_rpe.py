@@ -10,6 +10,7 @@ from typing import TypedDict
 
 import numpy as np
 
+from bmask_slam.evaluation.reference import file_in, read_reference, reference_file
 from bmask_slam.events import read_events
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError, finite_number
@@ -134,11 +135,11 @@ def evaluate(
     if with_body and with_scale:
         raise InputError("--hand-eye with --with-scale: a body's place needs metres; leave one out")
     run_or_trajectory, reference = Path(run_or_trajectory), Path(reference)
-    file = _file_in(run_or_trajectory, "trajectory.txt", "a run folder or a trajectory file")
-    truth_file = _reference_file(reference)
+    file = file_in(run_or_trajectory, "trajectory.txt", "a run folder or a trajectory file")
+    truth_file = reference_file(reference)
     frames_s = frame_stamps(file)
     stamps_s = read_times(times) if times else frames_s
-    estimate, truth = (read_trajectory(path, stamps_s) for path in (file, truth_file))
+    estimate, truth = read_trajectory(file, stamps_s), read_reference(truth_file, stamps_s)
     frames = None if frames_s is None else len(frames_s)
     try:
         estimate, body = _of_body(estimate, truth) if with_body else (estimate, [])
@@ -160,17 +161,6 @@ def _of_body(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, list[
     return body_trajectory(estimate, T_camera_body), _body_rows(T_camera_body)
 
 
-def read_reference(path: Path, stamps_s: Array | None = None) -> Trajectory:
-    """The trajectory in a file, or a sequence folder's ground truth.
-
-    ``stamps_s`` are the stamps of the lines of a file in the format of KITTI.
-
-    Raises:
-        InputError: the file is missing or broken.
-    """
-    return read_trajectory(_reference_file(path), stamps_s)
-
-
 def frame_stamps(trajectory_file: Path) -> Array | None:
     """Stamps of all frames of the run of a trajectory.txt; None if it belongs to no run."""
     path = trajectory_file.parent / "frames.csv"
@@ -178,10 +168,6 @@ def frame_stamps(trajectory_file: Path) -> Array | None:
         return None
     stamps = read_table(path, ("timestamp",), "run again", growing=True)["timestamp"]
     return np.array([finite_number(stamp, str(path)) for stamp in stamps])
-
-
-def _reference_file(path: Path) -> Path:
-    return _file_in(path, "groundtruth.txt", "a sequence with ground truth or a trajectory file")
 
 
 def format_table(rows: list[Row]) -> str:
@@ -275,11 +261,3 @@ def _coverage_rows(estimate: Trajectory, reference: Trajectory, matched: Traject
 def _span(trajectory: Trajectory) -> str:
     stamps_s = trajectory.timestamps_s
     return f"{stamps_s[0]:.3f} to {stamps_s[-1]:.3f} s" if len(stamps_s) else "without a pose"
-
-
-def _file_in(path: Path, name: str, expected: str) -> Path:
-    """The file itself, or the file of this name in a folder."""
-    file = path / name if path.is_dir() else path
-    if not file.is_file():
-        raise InputError(f"{file}: no such file; give {expected}")
-    return file

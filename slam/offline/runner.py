@@ -17,12 +17,12 @@ from typing import Any
 
 from bmask_slam.calibration.adoption import SelfCalibration
 from bmask_slam.config.configuration import dump
+from bmask_slam.evaluation.reference import read_reference
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import import_dense
 from bmask_slam.graph.sensors.streams import read_folder
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps
-from bmask_slam.graph.trajectory_formats import read_trajectory
 from bmask_slam.labelling.mask_memory import MaskMemory, RememberingSegmenter
 from bmask_slam.offline.checkpoint import Checkpoint, read_checkpoint
 from bmask_slam.offline.frame_loop import (
@@ -182,12 +182,11 @@ def find_reference(path: Path | None, sequence: Sequence) -> Trajectory | None:
     """
     if path is None:
         return sequence.groundtruth
-    file = path / "groundtruth.txt" if path.is_dir() else path
-    reference = read_trajectory(file, sequence.timestamps_s)
+    reference = read_reference(path, sequence.timestamps_s)
     shared = len(associate_stamps(sequence.timestamps_s, reference.timestamps_s)[0])
     if shared < MIN_REFERENCE_POSES:
         raise InputError(
-            f"{file}: has a pose within {MAX_TIME_DIFFERENCE_S:g} s for {shared} frames of "
+            f"{path}: has a pose within {MAX_TIME_DIFFERENCE_S:g} s for {shared} frames of "
             f"{sequence.folder}; give the reference of this sequence, in its clock"
         )
     return reference

@@ -1,7 +1,11 @@
-"""Decoding of colour and depth images, with checks for all ways in which they can be broken."""
+"""Decoding of colour and depth images, with checks for all ways in which they can be broken.
+
+And undistortion of images whose lens is beyond a camera's five coefficients.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -9,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Floats, Image
+from bmask_slam.graph.arrays import Array, Floats, Image
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import MAX_NUMBER, InputError
 from bmask_slam.semantics.instances.image_files import decode_image, read_colour
 
 SURFACE_STEP = 0.05
@@ -100,3 +104,67 @@ def check_size(path: Path, image: NDArray, camera: Camera) -> None:
             f"{path}: {width}x{height} pixels, but the camera has {camera.width}x{camera.height}; "
             "colour and registered depth must both have the size in camera.yaml"
         )
+
+
+_MAX_REMAPPED_PX = 32_767
+"""Longest side of an image that OpenCV's remap takes."""
+_RATIONAL_TERMS, _FISHEYE_TERMS = (8, 12, 14), (4,)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens with more distortion than a camera's five coefficients can say.
+
+    Attributes:
+        camera: the pinhole that its undistorted images are of; K is the same in both.
+        terms: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 and those that may follow, or the four of a fisheye.
+        is_fisheye: the equidistant model (Kannala and Brandt 2006), not the rational one.
+    """
+
+    camera: Camera
+    terms: tuple[float, ...]
+    is_fisheye: bool = False
+
+    def fault(self) -> str:
+        """What no lens can be, in words; "" for a possible one."""
+        counts = _FISHEYE_TERMS if self.is_fisheye else _RATIONAL_TERMS
+        if len(self.terms) not in counts:
+            return f"{len(self.terms)} distortion coefficients, not {' or '.join(map(str, counts))}"
+        if not (np.abs(np.array(self.terms)) <= MAX_NUMBER).all():
+            return "a number that is not finite"
+        size = max(self.camera.width, self.camera.height)
+        return f"{size} pixels in a row" if size > _MAX_REMAPPED_PX else ""
+
+    def undistorted_colour(self, rgb: Image) -> Image:
+        """Colour (H, W, 3) as the pinhole sees it, black where the lens does not look."""
+        return np.asarray(cv2.remap(rgb, *_lens_maps(self), cv2.INTER_LINEAR), np.uint8)
+
+    def undistorted_depth(self, stored: NDArray) -> NDArray:
+        """Stored depth (H, W) by nearest pixels, 0 where the lens does not look."""
+        return np.asarray(cv2.remap(stored, *_lens_maps(self), cv2.INTER_NEAREST))
+
+    def is_of_recorded(self, camera: Camera) -> bool:
+        """Whether a camera is of the images as recorded, and not of the undistorted ones.
+
+        Of the two it is that to which its own projection of the same rays is nearer.
+        """
+        pinhole = self.camera
+        if (camera.width, camera.height) != (pinhole.width, pinhole.height):
+            return True
+        steps = max(1, max(camera.width, camera.height) // 40)
+        rows, columns = np.mgrid[: camera.height : steps, : camera.width : steps]
+        straight: Array = np.stack([columns.ravel(), rows.ravel()], axis=-1).astype(float)
+        recorded = np.stack([m[rows, columns].ravel() for m in _lens_maps(self)], axis=-1)
+        own = camera.project_distorted(pinhole.backproject(straight, np.ones(len(straight))))
+        apart = [np.median(np.linalg.norm(own - one, axis=1)) for one in (recorded, straight)]
+        return bool(apart[0] < apart[1])
+
+
+@lru_cache(4)
+def _lens_maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Columns and rows (H, W) in the recorded image of each pixel of the undistorted one."""
+    K, terms, same = lens.camera.K, np.array(lens.terms), np.eye(3)
+    make = cv2.fisheye.initUndistortRectifyMap if lens.is_fisheye else cv2.initUndistortRectifyMap
+    size = lens.camera.width, lens.camera.height
+    columns, rows = make(K, terms, same, K, size, cv2.CV_32FC1)
+    return columns, rows

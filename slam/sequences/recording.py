@@ -14,7 +14,7 @@ from bmask_slam.graph.arrays import Array, Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.semantics.instances.image_files import decode_image, read_colour
-from bmask_slam.sequences.images import check_depth_type, check_size, depth_in_metres
+from bmask_slam.sequences.images import Lens, check_depth_type, check_size, depth_in_metres
 from bmask_slam.sequences.lists import ImageList
 from bmask_slam.sequences.registration import register_depth
 
@@ -27,11 +27,13 @@ class DepthForm:
         missing: stored value without depth; 0 is always one.
         camera: the depth camera, where depth is not registered to colour.
         T_colour_depth: (4, 4) from that camera to the colour camera.
+        lens: undistorts the depth images before all else; None: nothing does.
     """
 
     missing: int = 0
     camera: Camera | None = None
     T_colour_depth: Array = field(default_factory=lambda: np.eye(4))
+    lens: Lens | None = None
 
     def on_colour(self, stored: NDArray, camera: Camera) -> NDArray:
         """Stored values (h, w) as z-depth at the pixels (H, W) of the colour ``camera``.
@@ -40,6 +42,8 @@ class DepthForm:
         """
         if self.missing:
             stored = np.where(stored == self.missing, stored.dtype.type(0), stored)
+        if self.lens is not None:
+            stored = self.lens.undistorted_depth(stored)
         if self.camera is None:
             return stored
         z_m = np.divide(stored, camera.depth_scale, dtype=np.float32)
@@ -68,6 +72,7 @@ class Recording:
         colour, stored_depth: decode the image that a path stands for: (H, W, 3), red first, and
             (h, w) stored values, integers or floats. Both raise InputError.
         exists: whether an image is there.
+        lens: undistorts the colour images; None: nothing does.
     """
 
     layout: str
@@ -81,6 +86,7 @@ class Recording:
     colour: Callable[[Path], Image] = read_colour
     stored_depth: Callable[[Path], NDArray] = read_stored
     exists: Callable[[Path], bool] = Path.is_file
+    lens: Lens | None = None
 
     def read_rgb(self, file: Path, camera: Camera) -> Image:
         """The colour image (H, W, 3), red first.
@@ -90,7 +96,7 @@ class Recording:
         """
         rgb = self.colour(file)
         check_size(file, rgb, camera)
-        return rgb
+        return rgb if self.lens is None else self.lens.undistorted_colour(rgb)
 
     def read_depth(self, file: Path, camera: Camera) -> Floats:
         """Depth (H, W) in metres at the pixels of the colour camera, NaN where missing.

@@ -85,6 +85,7 @@ from bmask_slam.semantics.weights.checkpoints import load_network, read_state
 from bmask_slam.semantics.weights.stuff_weights import load_stuff
 from bmask_slam.semantics.weights.yolox_onnx import load_onnx
 from bmask_slam.sequences.bags.bag_file import open_bag
+from bmask_slam.sequences.bags.extrinsics import static_extrinsics
 from bmask_slam.sequences.bags.ros_images import (
     camera_of,
     colour_image,
@@ -92,7 +93,6 @@ from bmask_slam.sequences.bags.ros_images import (
     stamp_s,
 )
 from bmask_slam.sequences.bags.sensors import SensorTopics
-from bmask_slam.sequences.bags.topics import static_extrinsics
 from bmask_slam.sequences.cameras import read_camera
 from bmask_slam.sequences.lists import read_associations, read_pairs
 from bmask_slam.sequences.sequence import open_sequence

@@ -23,6 +23,8 @@ BEGIN_S = 1305031102.0
 RGB, DEPTH, INFO = "/camera/rgb/image_color", "/camera/depth/image", "/camera/rgb/camera_info"
 SMALL = SimpleNamespace(width=160, height=120, fx=131.25, fy=130.0, cx=79.625, cy=60.375)
 """The camera of ``synthetic_view`` where every fourth pixel is kept."""
+ONE_FILE = (".mcap", ".db3")
+"""Of ROS 2."""
 TYPES = {True: get_typestore(Stores.ROS1_NOETIC), False: get_typestore(Stores.ROS2_HUMBLE)}
 assert SMALL.fx * 4 == CAMERA.fx
 
@@ -68,7 +70,7 @@ def camera_info(distortion: tuple[float, ...] = (0.1, -0.2, 0.001, 0.002, 0.05))
 
 
 class BagMaker:
-    """Writes a bag: .bag is ROS 1, .mcap one file, else a folder (``sqlite3`` or ``mcap``).
+    """Writes a bag: .bag is ROS 1, .mcap and .db3 one file, else a folder, sqlite3 or mcap.
 
     ``packing``: "bz2" or "lz4" for ROS 1, "message", "file" or "storage" (of mcap) for ROS 2.
     ``begin_s``: when it is recorded.
@@ -79,7 +81,7 @@ class BagMaker:
     ) -> None:
         self.is1, self.path = path.suffix == ".bag", path
         self._types = TYPES[self.is1]
-        self._folder = path.with_suffix("") if path.suffix == ".mcap" else path
+        self._folder = path.with_suffix("") if path.suffix in ONE_FILE else path
         mcap = path.suffix == ".mcap" or storage == "mcap"
         plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
         self._writer: Any = (
@@ -98,8 +100,8 @@ class BagMaker:
 
     def __exit__(self, *_: object) -> None:
         self._writer.close()
-        if self.path.suffix == ".mcap":
-            (inside,) = self._folder.glob("*.mcap")
+        if self.path.suffix in ONE_FILE:
+            (inside,) = self._folder.glob(f"*{self.path.suffix}")
             inside.rename(self.path)
 
     def write(self, topic: str, stamp_s: float, stand_in: Any, frame_id: str = "optical") -> None:

@@ -198,7 +198,7 @@ def raw_lzfse(data: bytes) -> bytes:
     return b"bvx-" + struct.pack("<I", len(data)) + data + b"bvx$"
 
 
-def write_r3d(path: Path) -> None:
+def write_r3d(path: Path, pack: Callable[[bytes], bytes] = raw_lzfse) -> None:
     rows = []
     for T in POSES:
         A = T @ FLIP
@@ -213,7 +213,7 @@ def write_r3d(path: Path) -> None:
             image = cv2.imencode(".jpg", colour(k)[..., ::-1])[1].tobytes()
             packed.writestr(f"rgbd/{k}.jpg", image)
             values = np.where(depth_m(COARSE) > 0, depth_m(COARSE), np.nan).astype("<f4")
-            packed.writestr(f"rgbd/{k}.depth", raw_lzfse(values.tobytes()))
+            packed.writestr(f"rgbd/{k}.depth", pack(values.tobytes()))
 
 
 def write_polycam(folder: Path) -> None:

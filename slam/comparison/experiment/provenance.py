@@ -19,6 +19,7 @@ from typing import Any
 from bmask_slam import __version__, graph, mapping, semantics
 from bmask_slam.comparison.experiment.experiment import OPTIONS, Configuration, Experiment
 from bmask_slam.config.configuration import differences, dump, find_config, resolve
+from bmask_slam.evaluation.reference import TRUTH, TRUTH_BODY
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.files.reading import read_bytes, read_text
 from bmask_slam.rendering.sequence import RenderConfig
@@ -98,7 +99,9 @@ def folder_hash(folder: Path, camera: Path | None) -> str:
     """Hash of a recorded sequence: lists and camera by content, images by name and size."""
     files = sorted(p for p in folder.rglob("*") if p.is_file())
     sizes = (
-        f"{p.relative_to(folder)} {p.stat().st_size}" for p in files if p.name != "groundtruth.txt"
+        f"{p.relative_to(folder)} {p.stat().st_size}"
+        for p in files
+        if p.name not in (TRUTH, TRUTH_BODY)
     )
     lists = _contents((p for p in files if p.name in CONTENTS), folder)
     given = [read_text(camera, "give a camera.yaml")] if camera else []

@@ -44,7 +44,8 @@ class BagSource(MeasuredSource):
         self._path = path
         with open_bag(path) as bag:
             self._topics = find_topics(bag, topics or BagTopics())
-            self.camera, self._form = find_camera(bag, self._topics, camera)
+            self._found = find_camera(bag, self._topics, camera)
+        self.camera = self._found.camera
 
     def frames(self) -> Iterator[Frame]:
         """A frame of each pair of images; what cannot be decoded is counted and skipped."""
@@ -55,7 +56,7 @@ class BagSource(MeasuredSource):
 
     def _frames(self) -> Iterator[Frame]:
         names = (self._topics.rgb, self._topics.depth, str(self._path))
-        return message_frames(self._pairs(), lambda: self.camera, self._form, self.counts, names)
+        return message_frames(self._pairs(), lambda: self.camera, self._found, self.counts, names)
 
     def _pairs(self) -> Iterator[Pair[Any]]:
         pairer = Pairer[Any](self.counts, self.camera.depth_time_offset_s)

@@ -11,10 +11,10 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.live.sources.pairing import Pair
 from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.sequences.bags.ros_images import colour_image, depth_image
+from bmask_slam.sequences.bags.topics import BagCamera
 from bmask_slam.sequences.checks import check_sizes
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.sequences.images import depth_in_metres
-from bmask_slam.sequences.recording import DepthForm
 
 logger = logging.getLogger(__name__)
 
@@ -22,13 +22,14 @@ logger = logging.getLogger(__name__)
 def message_frames(
     pairs: Iterator[Pair[Any]],
     camera_now: Callable[[], Camera],
-    form: DepthForm,
+    found: BagCamera,
     counts: SourceCounts,
     names: tuple[str, str, str],
 ) -> Iterator[Frame]:
     """A frame of each pair; what cannot be decoded is counted in ``counts.broken`` and skipped.
 
-    ``camera_now`` gives the camera to read each frame with; ``names`` are those of colour topic,
+    ``camera_now`` gives the camera to read each frame with, ``found`` says what depth values mean
+    and which lens undistorts the images; ``names`` are those of colour topic,
     depth topic and source, for messages.
     """
     index = 0
@@ -38,11 +39,13 @@ def message_frames(
         try:
             rgb = colour_image(pair.rgb, rgb_at).copy()  # messages are read-only
             stored = depth_image(pair.depth, depth_at)
-            check_sizes(rgb, stored, camera, source_at, form.camera)
+            check_sizes(rgb, stored, camera, source_at, found.form.camera)
         except InputError as error:
             counts.broken += 1
             logger.warning("skipped: %s", error)
             continue
-        depth_m = depth_in_metres(form.on_colour(stored, camera), camera)
+        if found.lens is not None:
+            rgb = found.lens.undistorted_colour(rgb)
+        depth_m = depth_in_metres(found.form.on_colour(stored, camera), camera)
         yield Frame(index, pair.stamp_s, rgb, depth_m, depth_lag_s=pair.lag_s)
         index += 1

@@ -24,16 +24,10 @@ from bmask_slam.live.sources.message_frames import message_frames
 from bmask_slam.live.sources.pairing import DEPTH, RGB, Pair, Pairer
 from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
 from bmask_slam.sequences.bags.bag_file import INFO_TYPE, Bag, Topic
+from bmask_slam.sequences.bags.extrinsics import TRANSFORMS, static_extrinsics
 from bmask_slam.sequences.bags.ros_images import stamp_s
 from bmask_slam.sequences.bags.sensors import SensorTopics
-from bmask_slam.sequences.bags.topics import (
-    TRANSFORMS,
-    BagTopics,
-    find_camera,
-    find_topics,
-    first_message,
-    static_extrinsics,
-)
+from bmask_slam.sequences.bags.topics import BagTopics, find_camera, find_topics, first_message
 from bmask_slam.sequences.frame import Frame
 
 logger = logging.getLogger(__name__)
@@ -148,7 +142,8 @@ class Ros2Source(MeasuredSource):
         self._heard = _Heard(self.node, self._where, options)
         heard = cast("Bag", self._heard)
         self._topics = self._wait_for_topics(heard, options.topics)
-        self.camera, self._form = find_camera(heard, self._topics, options.camera)
+        self._found = find_camera(heard, self._topics, options.camera)
+        self.camera = self._found.camera
         self._frame = first_message(heard, self._topics.rgb).header.frame_id.lstrip("/")
         self._heard.keep(TRANSFORMS)
         self._pairer = Pairer[Any](self.counts, self.camera.depth_time_offset_s)
@@ -198,7 +193,7 @@ class Ros2Source(MeasuredSource):
             InputError: none came for ``silence_s``.
         """
         names = (self._where,) * 3
-        return message_frames(self._pairs(), lambda: self.camera, self._form, self.counts, names)
+        return message_frames(self._pairs(), lambda: self.camera, self._found, self.counts, names)
 
     def close(self) -> None:
         """End ``frames`` soon; may be called from any thread."""

@@ -51,12 +51,13 @@ def open_bag_recording(path: Path, camera: Path | Camera | None) -> Recording:
     bag_path, requested = split_path(path)
     with open_bag(bag_path) as bag:
         topics = find_topics(bag, requested)
-        found, form = find_camera(bag, topics, camera)
+        found, form, lens = find_camera(bag, topics, camera)
         places: dict[str, list[_Place]] = {RGB: [], DEPTH: []}
         for name, time_ns, message in bag.records((topics.rgb, topics.depth)):
             kind = RGB if name == topics.rgb else DEPTH
             places[kind].append(_Place(name, time_ns, stamp_s(message.header)))
     source = "given" if camera is not None else f"{topics.camera_info} of {bag_path}"
+    source += ", of undistorted images" if lens is not None else ""
     files = {kind: [path / kind / f"{p.stamp_s:.9f}" for p in places[kind]] for kind in places}
     lists = {
         kind: sorted_list(bag_path / kind, np.array([p.stamp_s for p in places[kind]]), files[kind])
@@ -68,6 +69,7 @@ def open_bag_recording(path: Path, camera: Path | Camera | None) -> Recording:
     return Recording(
         "ROS bag", path, lists[RGB], lists[DEPTH], found, source,
         form=form, colour=messages.colour, stored_depth=messages.depth, exists=index.__contains__,
+        lens=lens,
     )  # fmt: skip
 
 

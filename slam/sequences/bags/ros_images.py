@@ -16,6 +16,7 @@ from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.image_files import decode_bytes
+from bmask_slam.sequences.images import Lens
 
 _RAW: dict[str, tuple[str, int]] = {
     "rgb8": ("u1", 3), "bgr8": ("u1", 3), "8UC3": ("u1", 3),
@@ -38,6 +39,9 @@ _DEPTH_HEADER = "<iff"
 """Header of a compressedDepth image: format, and A and B of its quantised inverse depth."""
 _FIVE = ("plumb_bob", "rational_polynomial", "")
 """Distortion models whose first five coefficients are OpenCV's k1, k2, p1, p2, k3."""
+_FISHEYE = ("equidistant", "fisheye")
+_LENSES = ("rational_polynomial", *_FISHEYE)
+"""Models with more than these five, by which images are undistorted."""
 
 
 def stamp_s(header: Any) -> float:
@@ -108,41 +112,44 @@ def depth_encoding(message: Any, where: str) -> str:
     return name
 
 
-def camera_of(info: Any, depth_scale: float, rectified: bool, where: str) -> Camera:
+def camera_of(
+    info: Any, depth_scale: float, rectified: bool, where: str
+) -> tuple[Camera, Lens | None]:
     """The camera of a CameraInfo message: K and D, or P without distortion if ``rectified``.
 
+    And the lens, where D is more than a camera can say: the camera is that of its images once they
+    are undistorted.
+
     Raises:
-        InputError: it is not calibrated, or its distortion is not OpenCV's with five numbers.
+        InputError: it is not calibrated, or its distortion is of no model that is known.
     """
     cure = "give --camera F"
     if rectified:
-        projection = np.asarray(_field(info, "p"), float).reshape(3, 4)
-        K, distortion = projection[:, :3], np.zeros(5)
+        K, terms = np.asarray(_field(info, "p"), float).reshape(3, 4)[:, :3], np.zeros(5)
     else:
         K = np.asarray(_field(info, "k"), float).reshape(3, 3)
-        distortion = np.asarray(_field(info, "d"), float)
-        if (info.distortion_model not in _FIVE and distortion.any()) or distortion[5:].any():
-            raise InputError(
-                f"{where}: distortion {info.distortion_model!r} {distortion.tolist()} is not k1, "
-                f"k2, p1, p2, k3; rectify the images, or {cure}"
-            )
-        distortion = np.concatenate([distortion, np.zeros(5)])[:5]
+        terms = np.asarray(_field(info, "d"), float)
     if not (K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(K).all()):
         raise InputError(f"{where}: focal lengths of {K[0, 0]:g} and {K[1, 1]:g} px; {cure}")
-    k1, k2, p1, p2, k3 = (float(value) for value in distortion)
-    camera = Camera(
-        width=int(info.width),
-        height=int(info.height),
-        fx=float(K[0, 0]),
-        fy=float(K[1, 1]),
-        cx=float(K[0, 2]),
-        cy=float(K[1, 2]),
-        distortion=(k1, k2, p1, p2, k3),
-        depth_scale=depth_scale,
-    )
+    model, fisheye = info.distortion_model, info.distortion_model in _FISHEYE
+    beyond = bool(terms.any() if fisheye else terms[5:].any())
+    if terms.any() and model not in (_LENSES if beyond else _FIVE):
+        raise InputError(
+            f"{where}: distortion {model!r} {terms.tolist()} is not k1, k2, p1, p2, k3, nor of "
+            f"{', '.join(_LENSES)}; rectify the images, or {cure}"
+        )
+    k1, k2, p1, p2, k3 = [*(() if beyond else map(float, terms)), *[0.0] * 5][:5]
+    fx, fy, cx, cy = map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    size, five = (int(info.width), int(info.height)), (k1, k2, p1, p2, k3)
+    camera = Camera(*size, fx, fy, cx, cy, five, depth_scale)
     if fault := camera.fault():
         raise InputError(f"{where}: a camera with {fault}; {cure}")
-    return camera
+    if not beyond:
+        return camera, None
+    lens = Lens(camera, tuple(map(float, terms)), fisheye)
+    if fault := lens.fault():
+        raise InputError(f"{where}: a lens with {fault}; {cure}")
+    return camera, lens
 
 
 def _field(info: Any, name: str) -> Any:

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from dataclasses import astuple, dataclass
+from contextlib import suppress
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import inverse, make_pose, rotation_from_quaternion
 from bmask_slam.sequences.bags.bag_file import IMAGE_TYPES, INFO_TYPE, Bag
+from bmask_slam.sequences.bags.extrinsics import sdk_extrinsics, static_extrinsics
 from bmask_slam.sequences.bags.ros_images import (
     DEPTH_SCALES,
     camera_of,
@@ -25,6 +22,7 @@ from bmask_slam.sequences.bags.ros_images import (
 from bmask_slam.sequences.camera_presets import is_preset
 from bmask_slam.sequences.cameras import given_camera, read_camera
 from bmask_slam.sequences.checks import check_depth_scale, check_sizes
+from bmask_slam.sequences.images import Lens
 from bmask_slam.sequences.recording import DepthForm
 
 logger = logging.getLogger(__name__)
@@ -40,9 +38,6 @@ _FIELDS = {
 _SDK = "/device_0/sensor_{}/{}_0/"
 _SDK_COLOUR, _SDK_DEPTH = _SDK.format(1, "Color"), _SDK.format(0, "Depth")
 _SDK_UNITS = "/device_0/sensor_0/option/Depth_Units/value"
-TRANSFORMS = "/tf_static"
-MAX_STATIC = 100
-"""Messages of /tf_static that are read; there is one for each node that knows a transform."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +104,7 @@ def find_topics(bag: Bag, requested: BagTopics) -> BagTopics:
         rgb, depth = requested.rgb or rgb, requested.depth or depth  # noqa: PLW2901
         found = _form_of(rgb, images), _form_of(depth, images)
         if all(found):
-            return BagTopics(*found, requested.camera_info or _info_topic(rgb))
+            return BagTopics(*found, requested.camera_info or _info_topic(bag, rgb))
     raise InputError(
         f"{bag.path}: no images on the topics of any camera that is known; give --rgb-topic and "
         f"--depth-topic, of: {listed}"
@@ -122,52 +117,73 @@ def _form_of(wish: str, images: list[str]) -> str:
     return next((name for name in forms if name in images), "")
 
 
-def _info_topic(topic: str) -> str:
-    """The camera_info topic of an image topic, where image_transport or RealSense's SDK puts it."""
+def _info_topic(bag: Bag, topic: str) -> str:
+    """The camera_info topic of an image topic: beside it, or where RealSense's SDK has it in ROS 1.
+
+    Of the two the one that the bag has.
+    """
     base = topic.removesuffix("/compressed").removesuffix("/compressedDepth")
-    if base.endswith("/image/data"):
-        return f"{base.removesuffix('/image/data')}/info/camera_info"
-    return f"{base.rpartition('/')[0]}/camera_info"
+    beside = f"{base.rpartition('/')[0]}/camera_info"
+    sdk = f"{base.removesuffix('/image/data')}/info/camera_info"
+    return sdk if base.endswith("/image/data") and beside not in _infos(bag) else beside
 
 
-def find_camera(
-    bag: Bag, topics: BagTopics, given: Path | Camera | None
-) -> tuple[Camera, DepthForm]:
+class BagCamera(NamedTuple):
+    """The camera of a bag's colour images, once its ``lens`` has undistorted them if it has one.
+
+    ``form`` is what the values of its depth images mean.
+    """
+
+    camera: Camera
+    form: DepthForm
+    lens: Lens | None
+
+
+def find_camera(bag: Bag, topics: BagTopics, given: Path | Camera | None) -> BagCamera:
     """The given camera, or that of the camera_info, and what depth values mean.
 
     Depth of another frame is registered by the camera_info beside it and by /tf_static, or by the
-    extrinsics that RealSense's SDK records.
+    extrinsics that RealSense's SDK records. Images of a lens that no camera describes are
+    undistorted, unless the given camera is of those as recorded (``Lens.is_of_recorded``).
 
     Raises:
         InputError: no usable intrinsics, or images of another size.
     """
     rgb, depth = first_message(bag, topics.rgb), first_message(bag, topics.depth)
     scale = _depth_scale(bag, depth, topics.depth)
-    if isinstance(given, Camera):
-        camera = given
-    elif given is not None and not is_preset(given):
-        camera = read_camera(given)
-        check_depth_scale(camera, scale, str(given), f"{bag.path}'s depth")
+    preset = given if isinstance(given, Path) and is_preset(given) else None
+    if given is None or preset is not None:
+        own, lens = _camera_of(bag, topics.rgb, topics.camera_info, scale)
+        camera = own if preset is None else given_camera(preset, own)
     else:
-        camera = _camera_of(bag, topics.rgb, topics.camera_info, scale)
-        camera = camera if given is None else given_camera(given, camera)
+        camera, lens = given if isinstance(given, Camera) else read_camera(given), None
+        if not isinstance(given, Camera):
+            check_depth_scale(camera, scale, str(given), f"{bag.path}'s depth")
+        with suppress(InputError):  # a camera_info is not needed
+            lens = _camera_of(bag, topics.rgb, topics.camera_info, scale)[1]
     form = _depth_form(bag, topics, rgb.header.frame_id, depth.header.frame_id)
     images = colour_image(rgb, topics.rgb), depth_image(depth, topics.depth)
     check_sizes(*images, camera, f"{bag.path}: {topics.rgb} and {topics.depth}", form.camera)
-    return camera, form
+    if lens is None or lens.is_of_recorded(camera):
+        return BagCamera(camera, form, None)
+    logger.info("%s: images are undistorted by the lens of %s", bag.path, topics.camera_info)
+    return BagCamera(camera, form if form.camera else replace(form, lens=lens), lens)
 
 
 def _depth_scale(bag: Bag, depth: Any, topic: str) -> float:
     """Stored depth of one metre: by the encoding, or by the unit that RealSense's SDK records."""
     scale = DEPTH_SCALES[depth_encoding(depth, topic)]
     for _, unit in bag.messages(_SDK_UNITS):
-        unit_m = float(getattr(unit, "data", 0.0))
-        return 1 / unit_m if 1e-6 <= unit_m <= 1 else scale
+        with suppress(TypeError, ValueError):
+            unit_m = float(getattr(unit, "data", 0.0))  # a number in ROS 1, its text in ROS 2
+            return 1 / unit_m if 1e-6 <= unit_m <= 1 else scale
+        logger.warning("%s: %s is no number; depth is taken in 1/%g m", bag.path, _SDK_UNITS, scale)
+        break
     return scale
 
 
-def _camera_of(bag: Bag, topic: str, info: str, scale: float) -> Camera:
-    """The camera of an image topic by its camera_info. Raises InputError."""
+def _camera_of(bag: Bag, topic: str, info: str, scale: float) -> tuple[Camera, Lens | None]:
+    """The camera of an image topic by its camera_info, and its lens. Raises InputError."""
     rectified = "_rect" in topic.removesuffix("/compressed").rpartition("/")[2]
     return camera_of(_camera_info(bag, info), scale, rectified, f"{bag.path}: {info}")
 
@@ -177,64 +193,20 @@ def _depth_form(bag: Bag, topics: BagTopics, rgb_frame: str, depth_frame: str) -
     sdk = topics.depth.startswith(_SDK_DEPTH)
     if not sdk and (rgb_frame == depth_frame or any(word in topics.depth for word in REGISTERED)):
         return DepthForm()
-    known = (_SDK_COLOUR, _SDK_DEPTH) if sdk else (rgb_frame, depth_frame)
-    T_colour_depth = _sdk_extrinsics(bag) if sdk else static_extrinsics(bag, *known)
-    info = _info_topic(topics.depth)
+    T_colour_depth = sdk_extrinsics(bag, _SDK_COLOUR, _SDK_DEPTH) if sdk else None
+    if T_colour_depth is None and rgb_frame != depth_frame:
+        T_colour_depth = static_extrinsics(bag, rgb_frame, depth_frame)
+    info = _info_topic(bag, topics.depth)
     if T_colour_depth is None or info not in _infos(bag):
         logger.warning(
             "%s: colour is in the frame %r, depth in %r, and the bag does not tell where they are; "
             "depth must be registered to colour", bag.path, rgb_frame, depth_frame,
         )  # fmt: skip
         return DepthForm()
-    camera = _camera_of(bag, topics.depth, info, 1.0)
+    camera, lens = _camera_of(bag, topics.depth, info, 1.0)
     moved_mm = 1e3 * T_colour_depth[:3, 3]
     logger.info("%s: depth is registered, its camera is %s mm beside colour's", bag.path, moved_mm)
-    return DepthForm(camera=camera, T_colour_depth=T_colour_depth)
-
-
-def _sdk_extrinsics(bag: Bag) -> Array | None:
-    """T_colour_depth by the transforms of RealSense's SDK, each T_stream_reference."""
-    poses = []
-    for stream in (_SDK_COLOUR, _SDK_DEPTH):
-        message = next((m for _, m in bag.messages(f"{stream}tf/0")), None)
-        if message is None or not hasattr(message, "rotation"):
-            return None
-        poses.append(_pose_of(message, bag))
-    return poses[0] @ inverse(poses[1])
-
-
-def static_extrinsics(bag: Bag, rgb_frame: str, depth_frame: str) -> Array | None:
-    """T_rgb_depth of two frames by /tf_static; None if its tree does not hold both."""
-    parents: dict[str, tuple[str, Array]] = {}
-    for count, (_, message) in enumerate(bag.messages(TRANSFORMS)):
-        if count == MAX_STATIC or not hasattr(message, "transforms"):
-            break
-        for one in message.transforms:
-            parent, child = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
-            parents[child] = parent, _pose_of(one.transform, bag)
-    rgb, depth = (dict(_upwards(f.lstrip("/"), parents)) for f in (rgb_frame, depth_frame))
-    shared = next((frame for frame in rgb if frame in depth), None)
-    return None if shared is None else inverse(rgb[shared]) @ depth[shared]
-
-
-def _upwards(frame: str, parents: dict[str, tuple[str, Array]]) -> Iterator[tuple[str, Array]]:
-    """A frame and those above it, each with T_it_frame; ends where a tree runs in a circle."""
-    T_here_frame = np.eye(4)
-    for _ in range(len(parents) + 1):
-        yield frame, T_here_frame
-        if frame not in parents:
-            return
-        frame, T_parent_here = parents[frame]
-        T_here_frame = T_parent_here @ T_here_frame
-
-
-def _pose_of(transform: Any, bag: Bag) -> Array:
-    """A geometry_msgs/Transform as (4, 4). Raises InputError for what is no pose."""
-    q, t = transform.rotation, transform.translation
-    words = np.array([q.x, q.y, q.z, q.w, t.x, t.y, t.z], float)
-    if not (np.isfinite(words).all() and 0.5 < np.linalg.norm(words[:4]) < 2):
-        raise InputError(f"{bag.path}: a transform of {words.tolist()} is no pose; give --camera F")
-    return make_pose(rotation_from_quaternion(words[:4]), words[4:])
+    return DepthForm(camera=camera, T_colour_depth=T_colour_depth, lens=lens)
 
 
 def _infos(bag: Bag) -> list[str]:

@@ -10,6 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.evaluation.reference import (
+    TRUTH,
+    TRUTH_BODY,
+    TruthBody,
+    find_truth_body,
+)
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import MAX_TEXT_BYTES, read_bytes
 from bmask_slam.graph.sensors.streams import FILES
@@ -90,7 +96,9 @@ def convert(
         saved = replace(recording.camera, depth_scale=images.factor * recording.camera.depth_scale)
         write_camera(out / "camera.yaml", saved, f"{recording.layout}: {recording.camera_source}")
         if recording.groundtruth is not None:
-            write_tum(out / "groundtruth.txt", recording.groundtruth)
+            write_tum(out / TRUTH, recording.groundtruth)
+            if find_truth_body(recording.path) or find_truth_body(folder):
+                (out / TRUTH_BODY).write_text(TruthBody().yaml(), encoding="utf-8")  # the camera
         written.copied = _copy_sensors(recording.path, out)
     return written
 

@@ -8,10 +8,10 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
+from bmask_slam.evaluation.reference import TRUTH, read_reference
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.files.reading import read_lines
-from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.sequences.bags.bag_file import is_bag
 from bmask_slam.sequences.bags.bag_recording import open_bag_recording
 from bmask_slam.sequences.bags.topics import split_path
@@ -125,8 +125,6 @@ def _open_tum(folder: Path, given: Given) -> Recording:
             "'timestamp file'"
         )
     camera, source = (given, "given") if isinstance(given, Camera) else find_camera(folder, given)
-    truth = folder / "groundtruth.txt"
     lists = read_lists(folder)
-    return Recording(
-        "TUM", folder, *lists, camera, source, read_tum(truth) if truth.is_file() else None
-    )
+    truth = read_reference(folder) if (folder / TRUTH).is_file() else None
+    return Recording("TUM", folder, *lists, camera, source, truth)

@@ -32,8 +32,8 @@ def unpack_lzfse(data: bytes, size: int, where: str) -> bytes:
     library = import_extra("liblzfse", where, "record3d")
     try:
         found = bytes(library.decompress(data))
-    except library.error as error:
-        raise InputError(f"{where}: cannot be unpacked ({error}); export it again") from error
+    except (library.error, MemoryError) as error:  # it asks for more and more room, too
+        raise InputError(f"{where}: the LZFSE stream is broken; export it again") from error
     if len(found) != size:
         raise InputError(f"{where}: unpacks to {len(found)} bytes, not {size}; export it again")
     return found

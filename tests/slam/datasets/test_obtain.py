@@ -19,6 +19,7 @@ from bmask_slam.comparison.experiment.experiment_file import read_experiment
 from bmask_slam.datasets import web_file
 from bmask_slam.datasets.catalogue import Recording, find, read_catalogue
 from bmask_slam.datasets.obtain import RECEIVED, SUMS, obtain, read_sums
+from bmask_slam.evaluation.reference import BONN
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import read_tum
@@ -128,6 +129,15 @@ def test_the_first_hash_is_kept_and_a_later_file_must_agree(server, tmp_path, ca
 def test_a_bonn_archive_gets_its_camera(server, tmp_path):
     recording = Recording("bonn/tiny", f"{server.url}/bonn.zip", camera=CAMERA)
     assert open_sequence(obtain(recording, tmp_path)).camera.fx == 50.0
+    assert read_catalogue()["bonn/crowd"].layout == "bonn"
+
+
+def test_a_bonn_archives_poses_become_the_cameras(server, tmp_path):
+    recording = Recording("bonn/tiny", f"{server.url}/bonn.zip", layout="bonn", camera=CAMERA)
+    folder = obtain(recording, tmp_path)
+    expected = BONN.camera_of(read_tum(folder / "groundtruth.txt")).poses_world_camera
+    truth = open_sequence(folder).groundtruth
+    np.testing.assert_allclose(truth.poses_world_camera, expected, atol=1e-12)
 
 
 def test_an_icl_archive_is_brought_to_tum_layout(server, tmp_path):

@@ -1,4 +1,4 @@
-"""Frames from an Azure Kinect, or from its recordings, by pyk4a; depth aligned to colour."""
+"""Frames from a connected Azure Kinect by pyk4a, depth aligned to colour; no recordings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import import_extra
@@ -17,9 +16,8 @@ from bmask_slam.live.sources.cameras.camera_source import (
     CameraSource,
     chosen_camera,
 )
-from bmask_slam.sequences.camera_presets import is_preset
 from bmask_slam.sequences.checks import check_sizes
-from bmask_slam.sequences.images import depth_in_metres
+from bmask_slam.sequences.images import Lens, depth_in_metres
 
 SIZE, FPS = (1280, 720), 30
 DEPTH_SCALE = 1000.0
@@ -30,7 +28,8 @@ class AzureSource(CameraSource):
     """Device N: colour 1280x720, depth in the narrow field of view, both at 30 Hz.
 
     The lens has OpenCV's rational distortion, from which the five coefficients of a camera file
-    differ by pixels; images are undistorted here, unless a camera file is given.
+    differ by pixels; images are undistorted here, unless a camera file is given that is of the
+    images as recorded.
     """
 
     def __init__(self, device: int, camera: Path | None = None, silence_s: float = 10.0) -> None:
@@ -56,7 +55,7 @@ class AzureSource(CameraSource):
         except k4a.K4AException as error:
             reason = str(error) or type(error).__name__
             raise InputError(f"{self.name}: cannot start ({reason}); plug the camera in") from error
-        self._maps: tuple[Any, Any] | None = None
+        self._lens: Lens | None = None
         try:
             kind = k4a.CalibrationType.COLOR
             K = np.array(self._device.calibration.get_camera_matrix(kind), float)
@@ -64,9 +63,10 @@ class AzureSource(CameraSource):
                 *SIZE, K[0, 0], K[1, 1], K[0, 2], K[1, 2], depth_scale=DEPTH_SCALE, fps=FPS
             )
             self.camera = chosen_camera(camera, own, f"{self.name}'s depth")
-            if camera is None or is_preset(camera):
-                terms = np.array(self._device.calibration.get_distortion_coefficients(kind), float)
-                self._maps = undistortion_maps(K, terms)
+            terms = self._device.calibration.get_distortion_coefficients(kind)
+            lens = Lens(own, tuple(float(term) for term in terms))
+            if not lens.is_of_recorded(self.camera):
+                self._lens = lens
         except BaseException:
             self._release()
             raise
@@ -83,17 +83,11 @@ class AzureSource(CameraSource):
             return None
         rgb = np.asarray(cv2.cvtColor(colour, cv2.COLOR_BGRA2RGB), np.uint8)
         check_sizes(rgb, stored, self.camera, self.name)
-        if self._maps is not None:
-            rgb = np.asarray(cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR), np.uint8)
-            stored = np.asarray(cv2.remap(stored, *self._maps, cv2.INTER_NEAREST))
+        if self._lens is not None:
+            rgb = self._lens.undistorted_colour(rgb)
+            stored = self._lens.undistorted_depth(stored)
         stamp_s = 1e-6 * capture.color_timestamp_usec
         return CameraImages(stamp_s, rgb, depth_in_metres(stored, self.camera))
 
     def _release(self) -> None:
         self._device.stop()
-
-
-def undistortion_maps(K: Array, terms: Array) -> tuple[Any, Any]:
-    """Maps of ``cv2.remap`` to the pinhole of K (3, 3), by (8,) k1 k2 p1 p2 k3 k4 k5 k6."""
-    first, second = cv2.initUndistortRectifyMap(K, terms, np.eye(3), K, SIZE, cv2.CV_32FC1)
-    return first, second

@@ -17,7 +17,7 @@ import pytest
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.sources.cameras import oak_camera, record3d_camera
-from bmask_slam.live.sources.cameras.azure_camera import AzureSource, undistortion_maps
+from bmask_slam.live.sources.cameras.azure_camera import AzureSource
 from bmask_slam.live.sources.cameras.oak_camera import OakSource
 from bmask_slam.live.sources.cameras.record3d_camera import Record3dSource
 from bmask_slam.live.sources.opening import SourceOptions, open_source
@@ -266,24 +266,26 @@ def test_a_camera_that_is_unplugged_is_said(monkeypatch) -> None:
     assert (oak.stopped, asked["stopped"]) == (1, 1)
 
 
-def test_azures_images_are_undistorted_by_its_rational_model() -> None:
+@pytest.mark.parametrize("is_given", [False, True], ids=["its own camera", "a run's camera.yaml"])
+def test_azures_images_are_undistorted(is_given: bool, monkeypatch, tmp_path: Path) -> None:
     """A point is where the pinhole has it, in colour and in depth."""
-    matrix = np.array([[610.0, 0, 640], [0, 611, 365], [0, 0, 1]])
-    maps = undistortion_maps(matrix, RATIONAL)
+    pinhole = Camera(1280, 720, 610.0, 611.0, 640.0, 365.0, depth_scale=1000.0)
     points = np.array([[0.0, 0, 2], [1.4, 0.6, 2], [-1.2, -0.7, 2], [-1.0, 0.8, 2]])
     none = np.zeros(3)
-    seen = cv2.projectPoints(points, none, none, matrix, RATIONAL)[0][:, 0]
-    image, stored = np.zeros((720, 1280, 3), np.uint8), np.zeros((720, 1280), np.uint16)
+    seen = cv2.projectPoints(points, none, none, pinhole.K, RATIONAL)[0][:, 0]
+    capture = azure_capture(0)
     for u, v in seen.round().astype(int):
-        image[v - 3 : v + 4, u - 3 : u + 4] = 255
-        stored[v - 3 : v + 4, u - 3 : u + 4] = 2000
-    straight = cv2.remap(image, *maps, cv2.INTER_LINEAR)
-    depth = cv2.remap(stored, *maps, cv2.INTER_NEAREST)
-    pinhole = points @ matrix.T
-    for u, v in (pinhole[:, :2] / pinhole[:, 2:]).round().astype(int):
-        assert straight[v, u].min() > 200
-        assert depth[v, u] == 2000
-    assert np.abs(seen - pinhole[:, :2] / pinhole[:, 2:]).max() > 5  # it was not for nothing
+        capture.color[v - 3 : v + 4, u - 3 : u + 4] = 255
+        capture.transformed_depth[v - 3 : v + 4, u - 3 : u + 4] = 2000
+    monkeypatch.setitem(sys.modules, "pyk4a", fake_pyk4a([capture])[0])
+    path = tmp_path / "camera.yaml"
+    write_camera(path, pinhole)
+    source = AzureSource(0, path if is_given else None, SILENCE_S)
+    frame, pixels = next(source.frames()), pinhole.project(points)
+    for u, v in pixels.round().astype(int):
+        assert frame.rgb[v, u].min() > 200
+        assert frame.depth_m[v, u] == 2.0
+    assert np.abs(seen - pixels).max() > 5  # it was not for nothing
 
 
 # --- Record3D ------------------------------------------------------------------------------------

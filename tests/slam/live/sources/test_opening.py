@@ -128,11 +128,13 @@ def test_live_on_a_bag(recording: Sequence, bag: Path, tmp_path: Path, capsys) -
     T_first_last = inverse(found.poses_world_camera[0]) @ found.poses_world_camera[-1]
     expected = inverse(TRUTH[0]) @ TRUTH[-1]
     assert np.allclose(T_first_last, expected, atol=0.002)
-    mapped = open_run(tmp_path / "run")  # as bmask-slam map does: the run knows its bag
+    mapped = open_run(tmp_path / "run")  # the run knows its bag
     assert mapped.sequence.folder == bag.absolute()
     assert frame_index(mapped, mapped.keyframes[0]) == 0
     source = json.loads((tmp_path / "run" / "health.json").read_text())["source"]
     assert (source["unpaired_rgb"], source["duplicates"], source["gaps"]) == (1, 1, 0)
+    assert main(["map", str(tmp_path / "run"), "--mesh-voxel", "0.04", "--quiet"]) == 0
+    assert (tmp_path / "run" / "dense" / "cloud.ply").is_file()
 
 
 def test_run_and_map_on_a_bag(recording: Sequence, bag: Path, tmp_path: Path, capsys) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from recorded_bags import BEGIN_S, STEP_S, TYPES, BagMaker, camera_info, image, view, write_bag
+from recorded_bags import BEGIN_S, RGB, STEP_S, TYPES, BagMaker, camera_info, image, view, write_bag
 from small_layouts import COARSE, COLOUR, WALL_M, colour, depth_m, hole
 
+from bmask_slam.cli import main
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp
 from bmask_slam.live.sources.bag_source import BagSource
@@ -18,7 +20,7 @@ from bmask_slam.sequences.bags.topics import KNOWN_TOPICS, BagTopics, split_path
 from bmask_slam.sequences.sequence import open_sequence
 
 
-@pytest.mark.parametrize("name", ["a.bag", "a.mcap", "folder"])
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap", "a.db3", "folder"])
 def test_frames_are_read_in_any_order(tmp_path: Path, name: str, monkeypatch) -> None:
     monkeypatch.setattr(bag_recording, "KEPT_MESSAGES", 3)
     monkeypatch.setattr(bag_recording, "AHEAD_NS", 4_000_000)  # of 1 ms a message
@@ -30,6 +32,21 @@ def test_frames_are_read_in_any_order(tmp_path: Path, name: str, monkeypatch) ->
         assert frame.timestamp_s == pytest.approx(BEGIN_S + index * STEP_S, abs=1e-6)
         assert np.array_equal(frame.rgb, expected.rgb)
         assert np.array_equal(frame.depth_m, expected.depth_m, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.db3"])
+def test_a_bag_is_converted(name: str, tmp_path: Path, capsys) -> None:
+    path, out = write_bag(tmp_path / name), tmp_path / "out"
+    assert main(["convert", f"{path}", f"{out}", "--rgb-topic", RGB]) == 0
+    assert "ROS bag: 4 colour and 4 depth images" in capsys.readouterr().out
+    before, after = open_sequence(path), open_sequence(out)
+    assert after.recording.layout == "TUM"
+    assert after.camera == replace(before.camera, depth_scale=after.camera.depth_scale)
+    assert np.allclose(after.timestamps_s, before.timestamps_s, atol=1e-6)
+    for k in range(4):
+        assert np.array_equal(after.load(k).rgb, before.load(k).rgb)
+        depths = after.load(k).depth_m, before.load(k).depth_m
+        assert np.allclose(*depths, atol=1.1e-4, equal_nan=True)
 
 
 @pytest.mark.parametrize("begin_s", [0.0, 1.0])

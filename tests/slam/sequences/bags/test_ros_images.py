@@ -135,20 +135,28 @@ def test_messages_that_are_not_depth_are_refused(message: object) -> None:
 
 
 def test_the_camera_of_raw_and_rectified_images() -> None:
-    camera = camera_of(camera_info(), 1.0, rectified=False, where="here")
+    camera, lens = camera_of(camera_info(), 1.0, rectified=False, where="here")
+    assert lens is None
     assert (camera.width, camera.height) == (160, 120)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (131.25, 130.0, 79.625, 60.375)
     assert camera.distortion == (0.1, -0.2, 0.001, 0.002, 0.05)
-    rectified = camera_of(camera_info(), 1.0, rectified=True, where="here")
+    rectified, _ = camera_of(camera_info(), 1.0, rectified=True, where="here")
     assert (rectified.fx, rectified.cx, rectified.cy) == (100.0, 80.0, 60.0)
     assert not any(rectified.distortion)
 
 
 def test_an_uncalibrated_or_unsupported_camera_is_refused() -> None:
     info = camera_info()
-    info.distortion_model = "equidistant"
-    with pytest.raises(InputError, match=r"here: distortion 'equidistant'.*--camera"):
+    info.distortion_model = "double_sphere"
+    with pytest.raises(InputError, match=r"here: distortion 'double_sphere'.*--camera"):
         camera_of(info, 1.0, rectified=False, where="here")
+    info.distortion_model = "equidistant"
+    with pytest.raises(InputError, match="here: a lens with 5 distortion coefficients, not 4"):
+        camera_of(info, 1.0, rectified=False, where="here")
+    broken = camera_info((0.1, 0, 0, 0, 0, np.inf, 0, 0))
+    broken.distortion_model = "rational_polynomial"
+    with pytest.raises(InputError, match="here: a lens with a number that is not finite"):
+        camera_of(broken, 1.0, rectified=False, where="here")
     with pytest.raises(InputError, match="distortion"):
         camera_of(camera_info((0.1, 0, 0, 0, 0, 0.2, 0, 0)), 1.0, rectified=False, where="here")
     zeros = camera_info(())

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+import struct
+import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +21,7 @@ from small_layouts import (
     colour,
     hole,
     raw_lzfse,
+    write_r3d,
     write_small,
     write_tum,
 )
@@ -224,6 +228,47 @@ def test_lzfse_is_measured_before_it_is_unpacked() -> None:
     for data in (bomb, raw_lzfse(b"abcd")[:-4], b"", b"bvx1" + bytes(20)):
         with pytest.raises(InputError):
             unpack_lzfse(data, 4, "here")
+
+
+def test_depth_of_record3d_is_unpacked_by_the_library(tmp_path: Path) -> None:
+    library = pytest.importorskip("liblzfse")
+    layout = next(small for small in SMALL_LAYOUTS if small.name == "Record3D")
+    write_r3d(tmp_path / "a.r3d", library.compress)
+    with zipfile.ZipFile(tmp_path / "a.r3d") as packed:
+        assert packed.read("rgbd/0.depth")[:4] == b"bvxn"
+    sequence = open_sequence(tmp_path / "a.r3d")
+    check_frames(sequence, layout)
+    check_poses(sequence, layout)
+
+
+@pytest.mark.parametrize("rows", [256, 4000])
+def test_blocks_of_the_library_are_measured(rows: int) -> None:
+    """One block, as large as a LiDAR's image of 192x256, and several."""
+    library = pytest.importorskip("liblzfse")
+    v, u = np.mgrid[:rows, :192]
+    data = (2 + np.sin(u / 30) + 0.1 * np.cos(v / 20).round(2)).astype("<f4").tobytes()
+    packed = library.compress(data)
+    assert packed[:4] == b"bvx2"
+    assert unpack_lzfse(packed, len(data), "here") == data
+    with pytest.raises(InputError, match=f"here: unpacks to {len(data)} bytes, not 8"):
+        unpack_lzfse(packed, 8, "here")
+    with pytest.raises(InputError, match=r"here: no LZFSE stream \(it is cut off\)"):
+        unpack_lzfse(packed[: len(packed) // 2], len(data), "here")
+
+
+BROKEN_BLOCK = b"bvxn" + struct.pack("<II", 4, 4) + b"abcd" + b"bvx$"
+
+
+def test_what_the_library_cannot_unpack_is_refused() -> None:
+    pytest.importorskip("liblzfse")
+    with pytest.raises(InputError, match="here: the LZFSE stream is broken"):
+        unpack_lzfse(BROKEN_BLOCK, 4, "here")
+
+
+def test_packed_depth_without_the_library_names_the_extra(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "liblzfse", None)
+    with pytest.raises(InputError, match=r"here: needs liblzfse.*bmask-slam\[record3d\]"):
+        unpack_lzfse(BROKEN_BLOCK, 4, "here")
 
 
 def test_what_is_none_is_refused(tmp_path: Path) -> None:
