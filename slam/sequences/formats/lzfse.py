@@ -29,7 +29,7 @@ def unpack_lzfse(data: bytes, size: int, where: str) -> bytes:
         raise InputError(f"{where}: unpacks to {unpacked} bytes, not {size}; export it again")
     if all(magic == _RAW for magic, _, _ in blocks):
         return b"".join(data[begin + 8 : begin + 8 + raw] for _, begin, raw in blocks)
-    library = import_extra("liblzfse", where, "record3d")
+    library = import_extra("lzfse", where, "record3d")
     try:
         found = bytes(library.decompress(data))
     except (library.error, MemoryError) as error:  # it asks for more and more room, too

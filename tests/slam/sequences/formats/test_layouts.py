@@ -231,7 +231,7 @@ def test_lzfse_is_measured_before_it_is_unpacked() -> None:
 
 
 def test_depth_of_record3d_is_unpacked_by_the_library(tmp_path: Path) -> None:
-    library = pytest.importorskip("liblzfse")
+    library = pytest.importorskip("lzfse")
     layout = next(small for small in SMALL_LAYOUTS if small.name == "Record3D")
     write_r3d(tmp_path / "a.r3d", library.compress)
     with zipfile.ZipFile(tmp_path / "a.r3d") as packed:
@@ -244,7 +244,7 @@ def test_depth_of_record3d_is_unpacked_by_the_library(tmp_path: Path) -> None:
 @pytest.mark.parametrize("rows", [256, 4000])
 def test_blocks_of_the_library_are_measured(rows: int) -> None:
     """One block, as large as a LiDAR's image of 192x256, and several."""
-    library = pytest.importorskip("liblzfse")
+    library = pytest.importorskip("lzfse")
     v, u = np.mgrid[:rows, :192]
     data = (2 + np.sin(u / 30) + 0.1 * np.cos(v / 20).round(2)).astype("<f4").tobytes()
     packed = library.compress(data)
@@ -260,14 +260,14 @@ BROKEN_BLOCK = b"bvxn" + struct.pack("<II", 4, 4) + b"abcd" + b"bvx$"
 
 
 def test_what_the_library_cannot_unpack_is_refused() -> None:
-    pytest.importorskip("liblzfse")
+    pytest.importorskip("lzfse")
     with pytest.raises(InputError, match="here: the LZFSE stream is broken"):
         unpack_lzfse(BROKEN_BLOCK, 4, "here")
 
 
 def test_packed_depth_without_the_library_names_the_extra(monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "liblzfse", None)
-    with pytest.raises(InputError, match=r"here: needs liblzfse.*bmask-slam\[record3d\]"):
+    monkeypatch.setitem(sys.modules, "lzfse", None)
+    with pytest.raises(InputError, match=r"here: needs lzfse.*bmask-slam\[record3d\]"):
         unpack_lzfse(BROKEN_BLOCK, 4, "here")
 
 
