@@ -56,8 +56,8 @@ def main() -> None:
     arguments = parser.parse_args()
     with TemporaryDirectory() as folder:
         options = DriveMapOptions()
-        given = arguments.run, "nav2", Path(folder) / "map.yaml", options
-        (yaml, pgm), text = export_drive_map(*given)
+        made, text = export_drive_map(arguments.run, "nav2", Path(folder) / "map.yaml", options)
+        yaml, pgm = made
         said, cells = read_yaml(yaml), np.asarray(cv2.imread(str(pgm), cv2.IMREAD_GRAYSCALE))
     T_map_world = np.array(said["bmask_slam_T_map_world"])
     positions_map = transform(T_map_world, Run(arguments.run).trajectory.positions_world)

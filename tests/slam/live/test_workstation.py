@@ -385,8 +385,12 @@ class Away:
     there: list[End]
     here: list[End]
     away: bool = False
+    refusals: int = 0
 
     def worker(self, name: str, arguments: Any, state: Path | None = None) -> End:
+        if self.refusals and not self.away:
+            self.refusals -= 1
+            raise InputError(f"another token, {name}")
         if self.away:
             raise WorkstationAwayError("away")
         self.there.append(End(name, arguments, state))
@@ -467,6 +471,40 @@ def test_a_failure_there_counts_and_the_end_stays_here(machines, tmp_path: Path)
     worker.receive()
     assert len(machines.there) == 1
     assert len(machines.here[0].sent) == 3
+
+
+def test_a_refusal_later_is_said_and_tried_again(machines, tmp_path, monkeypatch, caplog) -> None:
+    """At the start it ends the program."""
+    for module in (map_return, supervision):
+        monkeypatch.setattr(module, "REFUSED_S", 0.02)
+    machines.refusals = 2
+    with pytest.raises(InputError, match="another token, map"):
+        MapWorker((), lambda message: None, MapPlace(tmp_path, machines))
+    with pytest.raises(InputError, match="another token, segmenter"):
+        RemoteSegmenter(SegmenterOptions(), tmp_path, workstation=machines)
+    machines.away = True
+    segmenter = RemoteSegmenter(SegmenterOptions(), tmp_path, workstation=machines)
+    machines.refusals, machines.away = 2, False
+    with closing(segmenter):
+        until(lambda: segmenter.receive_masks() or not segmenter.worker.is_away)
+    assert caplog.text.count("another token, segmenter; the segmenter is not used") == 2
+    machines.away = True
+    worker = MapWorker((), lambda message: None, MapPlace(tmp_path, machines))
+    here = machines.here[0]
+    machines.refusals, machines.away = 2, False
+
+    def step() -> bool:
+        worker.receive()
+        here.answers += [StateSaved(number, message.path) for number, message in here.sent]
+        here.sent.clear()
+        return len(machines.there) > 1
+
+    until(step)
+    assert caplog.text.count("another token, map; the map stays here") == 2
+    machines.there[-1].answers.append(Ready())
+    until(lambda: worker.receive() or worker.workstation == "connected")
+    assert (worker.losses, here.is_running) == (0, False)
+    worker.kill()
 
 
 def test_masks_of_other_classes_are_not_used(machines, tmp_path: Path, caplog) -> None:
