@@ -27,16 +27,18 @@ BIN_M = 0.04
 GUESS_DEG, CANDIDATES = 45.0, 400
 
 
-def up_direction(normals: NDArray[np.floating], first_guess: Array) -> Array:
+def up_direction(
+    normals: NDArray[np.floating], first_guess: Array, guess_deg: float = GUESS_DEG
+) -> Array:
     """The world's upward unit vector (3,): the most frequent normal (N, 3) near ``first_guess``.
 
     Floors and table tops have this normal, ceilings its opposite. The guess, e.g. the cameras' mean
-    -y axis, may be GUESS_DEG off. The search starts with the one of CANDIDATES normals that has
+    -y axis, may be ``guess_deg`` off. The search starts with the one of CANDIDATES normals that has
     most others within 8 degrees, and refines it by means over cones that narrow to 4 degrees.
     """
     up = first_guess / np.linalg.norm(first_guess)
     cosine = normals @ up
-    possible = (np.sign(cosine)[:, None] * normals)[np.abs(cosine) > np.cos(np.deg2rad(GUESS_DEG))]
+    possible = (np.sign(cosine)[:, None] * normals)[np.abs(cosine) > np.cos(np.deg2rad(guess_deg))]
     if len(possible) < 100:
         return np.asarray(up, float)
     candidates = possible[:: max(len(possible) // CANDIDATES, 1)]
@@ -98,6 +100,11 @@ def plan_frame(points: Array, normals: Array, first_guess: Array, cell_m: float)
     up = up_direction(normals, first_guess)
     facing = points[normals @ up > UPRIGHT_COSINE].astype(float)
     up, floor_m = fit_floor(facing, up, floor_height(facing @ up))
+    return PlanFrame(axes_along_walls(up, normals), floor_m, cell_m)
+
+
+def axes_along_walls(up: Array, normals: Array) -> Array:
+    """Axes (3, 3), rows right, forward and ``up`` (3,), of walls with normals among (N, 3)."""
     helper = np.eye(3)[np.argmin(np.abs(up))]
     right = np.cross(helper, up)
     right /= np.linalg.norm(right)
@@ -109,7 +116,7 @@ def plan_frame(points: Array, normals: Array, first_guess: Array, cell_m: float)
         np.cos(turn) * right + np.sin(turn) * forward,
         np.cos(turn) * forward - np.sin(turn) * right,
     )
-    return PlanFrame(np.stack([right, forward, up]), floor_m, cell_m)
+    return np.stack([right, forward, up])
 
 
 class FloorPlan:

@@ -29,11 +29,13 @@ _ALL_FREE, _ALL_OCCUPIED = 0x5555, 0xAAAA
 """Bits of a child in OctoMap's binary format, the first bit of two being the lower; 0: unknown."""
 
 
-def write_nav2(path: Path, grid: OccupancyGrid, T_map_world: Array) -> tuple[Path, Path]:
+def write_nav2(
+    path: Path, grid: OccupancyGrid, T_map_world: Array, comment: str = ""
+) -> tuple[Path, Path]:
     """Write NAME.yaml and NAME.pgm, which nav2's and ROS 1's map_server load.
 
     The image's upper row is the largest y. ``T_map_world`` is kept in the YAML under a key of its
-    own, which map_server ignores.
+    own, which map_server ignores, and a ``comment`` of one line at the top.
     """
     yaml, pgm = path.with_suffix(".yaml"), path.with_suffix(".pgm")
     values: NDArray[np.uint8] = np.full_like(grid.cells, GREY, np.uint8)
@@ -52,8 +54,9 @@ def write_nav2(path: Path, grid: OccupancyGrid, T_map_world: Array) -> tuple[Pat
         "free_thresh": FREE_SHARE,
         "bmask_slam_T_map_world": np.round(T_map_world, 9).tolist(),
     }
+    head = f"# {comment}\n" if comment else ""
     with whole_file(yaml) as temporary:
-        temporary.write_text(format_yaml(content), encoding="utf-8")
+        temporary.write_text(head + format_yaml(content), encoding="utf-8")
     return yaml, pgm
 
 

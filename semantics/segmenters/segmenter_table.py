@@ -10,7 +10,7 @@ from pathlib import Path
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.extras import import_extra
-from bmask_slam.semantics.labels import read_label_set
+from bmask_slam.semantics.labels import LabelSet, read_label_set
 from bmask_slam.semantics.segmenters.own_class import OwnClass, names_class, own_segmenter
 from bmask_slam.semantics.segmenters.segmenter import (
     CocoSegmenter,
@@ -122,6 +122,19 @@ def make_segmenter(
     if options.name == "precomputed":
         return _precomputed(options)
     return _network(options, find_weights)
+
+
+def labels_of(options: SegmenterOptions, sequence: Path) -> LabelSet:
+    """The classes of a segmenter, of which a network is not loaded.
+
+    Raises:
+        InputError: only a network's weights say them; else as ``make_segmenter``.
+    """
+    if not options.is_network:
+        return make_segmenter(options, sequence).labels
+    if options.labels is None and options.name != "light":
+        raise InputError(f"segmenter {options.name!r}: only its weights say its classes; --labels")
+    return read_label_set(options.labels or "coco")
 
 
 def _precomputed(options: SegmenterOptions) -> Segmenter:

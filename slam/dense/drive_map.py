@@ -15,11 +15,12 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import make_pose
 from bmask_slam.mapping.inverse_depth.depth_map import read_depth_map
 from bmask_slam.mapping.products.floor_plan import (
+    GUESS_DEG,
     UPRIGHT_COSINE,
-    PlanFrame,
+    axes_along_walls,
     fit_floor,
     floor_height,
-    plan_frame,
+    up_direction,
 )
 from bmask_slam.mapping.products.occupancy import (
     FREE,
@@ -32,11 +33,14 @@ from bmask_slam.mapping.products.occupancy_files import write_nav2, write_octoma
 from bmask_slam.run_folder.landmark_file import DenseCloud
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.semantics.beliefs.surface_geometry import FLOORS
+from bmask_slam.world.keyframe import Keyframe
 
 logger = logging.getLogger(__name__)
 
 DriveFormat = Literal["nav2", "octomap"]
 MIN_FLOOR_POINTS = 200
+GRAVITY_DEG, LABELLED_DEG = 6.0, 75.0
+"""The floor's normal may be so far from gravity, and a labelled floor's from the cameras' up."""
 MIN_RESOLUTION_M, MAX_RESOLUTION_M = 0.01, 1.0
 MAX_CELLS = 1 << 27
 """Of a grid: 580 m square at 5 cm. With a few points that are wrong by far it would be larger."""
@@ -85,12 +89,13 @@ def export_drive_map(
         raise InputError(f"{out}: the folder {out.parent} does not exist; make it first")
     if out.resolve().parent == run.resolve():
         raise InputError(f"{out}: is in the run, which stays as it is; choose another --out")
-    voxels = voxel_map(run, options.resolution_m)
+    voxels, frame = voxel_map(run, options.resolution_m)
     counts = f"{int(voxels.occupied.sum())} occupied, {int((~voxels.occupied).sum())} free"
     if form == "octomap":
         path = out.with_suffix(".bt")
         nodes = write_octomap(path, voxels)
-        return (path,), f"{counts} voxels of {options.resolution_m:g} m in {nodes} nodes, z up"
+        size = f"voxels of {options.resolution_m:g} m in {nodes} nodes, z up"
+        return (path,), f"{counts} {size}\n{frame}"
     spans = np.ptp(voxels.keys[:, :2], axis=0) + 1
     if spans.prod() > MAX_CELLS:
         size = " x ".join(f"{span * options.resolution_m:.0f}" for span in spans)
@@ -102,16 +107,21 @@ def export_drive_map(
         f"{width} x {height} cells of {options.resolution_m:g} m: {shares[0]:.1f} % occupied from "
         f"{options.low_m:g} to {options.high_m:g} m, {shares[1]:.1f} % free, the rest unknown"
     )
-    return write_nav2(out, grid, voxels.T_map_world), text
+    return write_nav2(out, grid, voxels.T_map_world, frame), f"{text}\n{frame}"
 
 
-def voxel_map(run: Path, resolution_m: float) -> VoxelMap:
-    """The free and occupied voxels of a run with a dense map. Raises InputError."""
+def voxel_map(run: Path, resolution_m: float) -> tuple[VoxelMap, str]:
+    """The free and occupied voxels of a run with a dense map, and how its floor was found.
+
+    Raises:
+        InputError: no run, no dense map, or a broken one.
+    """
     depths = run / "dense" / "depth"
     if not depths.is_dir():
         raise InputError(f"{depths}: no dense map here; make it with bmask-slam map {run}")
     saved, cloud = read_saved_map(run), Run(run).dense_cloud
-    carver = VoxelCarver(resolution_m, map_frame(saved, cloud))
+    T_map_world, frame = map_frame(saved, cloud)
+    carver = VoxelCarver(resolution_m, T_map_world)
     carver.add_surface(cloud.points_world)
     carved = 0
     for keyframe in saved.keyframes:
@@ -122,29 +132,46 @@ def voxel_map(run: Path, resolution_m: float) -> VoxelMap:
                 raise InputError(f"{path}: of another size than the camera; make the map again")
             carver.carve(depth_m, saved.camera, keyframe.T_world_camera)
             carved += 1
-    logger.info("%s: free space by the depth of %d keyframes", run, carved)
-    return carver.voxels()
+    logger.info("%s: free space by the depth of %d keyframes; %s", run, carved, frame)
+    return carver.voxels(), frame
 
 
-def map_frame(saved: SavedMap, cloud: DenseCloud) -> Array:
-    """T_map_world (4, 4): z up, the floor at 0, x along the walls.
+def map_frame(saved: SavedMap, cloud: DenseCloud) -> tuple[Array, str]:
+    """T_map_world (4, 4): z up, the floor at 0, x along the walls; and a text on how it was found.
 
+    Up is near gravity's, if an accelerometer or an IMU was in the graph, else near the cameras'.
     The floor is that of the points with a floor's label where there are enough, else the lowest
-    level of points that face up.
+    level of points that face up. Its plane says up exactly, unless it is a slope by gravity.
 
     Raises:
         InputError: an empty cloud.
     """
-    points, normals = cloud.points_world, cloud.normals_world
+    points, normals, gravity = cloud.points_world, cloud.normals_world, saved.up_world
     if not len(points):
         raise InputError(f"{saved.path}: its dense cloud is empty")
-    guess = -np.mean([k.T_world_camera[:3, 1] for k in saved.keyframes], axis=0)
-    frame = plan_frame(points, normals, guess, 1.0)
-    up = frame.axes[2]
-    floor = points[np.isin(cloud.labels, FLOORS) & (normals @ up > UPRIGHT_COSINE)]
-    if len(floor) >= MIN_FLOOR_POINTS:
-        up, floor_m = fit_floor(floor, up, floor_height(floor @ up))
-        right = frame.axes[0] - (frame.axes[0] @ up) * up
-        right /= np.linalg.norm(right)
-        frame = PlanFrame(np.stack([right, np.cross(up, right), up]), floor_m, 1.0)
-    return make_pose(frame.axes, np.array([0.0, 0.0, -frame.floor_m]))
+    guess = _cameras_up(saved.keyframes) if gravity is None else gravity
+    limits_deg = (LABELLED_DEG, GUESS_DEG) if gravity is None else (GRAVITY_DEG, GRAVITY_DEG)
+    facing = UPRIGHT_COSINE if gravity is None else np.cos(np.deg2rad(2 * GRAVITY_DEG))
+    labelled = np.isin(cloud.labels, FLOORS)
+    for level, limit_deg in zip((labelled, labelled | True), limits_deg, strict=True):
+        up = up_direction(normals[level], guess, limit_deg)
+        floor = points[level & (normals @ up > facing)]
+        if len(floor) >= MIN_FLOOR_POINTS:
+            break
+    by_labels = level is labelled
+    up, floor_m = fit_floor(floor, up, floor_height(floor @ up))
+    if gravity is not None and up @ gravity < np.cos(np.deg2rad(GRAVITY_DEG)):
+        up, floor_m = gravity, floor_height(floor @ gravity)
+    guessed = (
+        "the points labelled floor" if by_labels else "level surfaces and the cameras' attitude"
+    )
+    text = f"up by {guessed if gravity is None else 'gravity, which was measured'}, the floor by "
+    text += "its labels" if by_labels else "the lowest level"
+    return make_pose(axes_along_walls(up, normals), np.array([0.0, 0.0, -floor_m])), text
+
+
+def _cameras_up(keyframes: list[Keyframe]) -> Array:
+    """The mean upward axis (3,) of the images, a unit vector, of keyframes with a pose."""
+    poses = np.array([k.T_world_camera for k in keyframes])
+    up = -np.mean(poses[np.isfinite(poses).all(axis=(1, 2)), :3, 1], axis=0)
+    return np.asarray(up / np.linalg.norm(up), float)

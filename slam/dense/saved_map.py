@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Ints, Mask
+from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.graph_update import GRAVITY, reference_frame_id
 from bmask_slam.graph.files.array_file import fitting, part
 from bmask_slam.mapping.inverse_depth.dense_mapper import DepthSource
 from bmask_slam.run_folder.map_file import MAP, RunLabels, read_map, saved_labels
@@ -20,6 +21,8 @@ from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_state import world_of
 from bmask_slam.world.world_map import WorldMap
+
+MAX_LENGTH_ERROR = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +35,8 @@ class SavedMap:
         keyframes: those of its largest segment, oldest first.
         camera: of the images, with distortion.
         labels: the classes of its landmarks; None if the run had no segmenter.
+        up_world: (3,) unit vector of these keyframes, by an accelerometer or an IMU in the graph;
+            None without.
     """
 
     path: Path
@@ -39,6 +44,7 @@ class SavedMap:
     keyframes: list[Keyframe]
     camera: Camera
     labels: RunLabels | None = None
+    up_world: Array | None = None
 
     def poses(self) -> dict[int, Array]:
         """The current T_world_camera (4, 4) of every keyframe by its id."""
@@ -101,6 +107,21 @@ def read_saved_map(path: Path) -> SavedMap:
     state, camera = read_map(path)
     with fitting(path / MAP):
         world = world_of(part(state, "mapper.world"))
-        keyframes = world.in_segment(world.largest_segment())
+        segment = world.largest_segment()
         labels = saved_labels(part(state, "semantics"), path)
-    return SavedMap(path, world, keyframes, camera, labels)
+        up_world = _measured_up(part(state, "mapper.graph"), segment)
+    return SavedMap(path, world, world.in_segment(segment), camera, labels, up_world)
+
+
+def _measured_up(graph: Arrays, segment: int) -> Array | None:
+    """The z axis (3,) of a segment's reference frame, if gravity was measured in it."""
+    if not graph:
+        return None
+    frame = reference_frame_id(segment)
+    of_frame = graph["pose_factor_keyframes"][:, 0] == frame
+    if not (of_frame & (graph["pose_factor_kinds"] == GRAVITY)).any():
+        return None
+    up = graph["poses_world_camera"][graph["keyframe_ids"] == frame][0, :3, 2]
+    if not abs(np.linalg.norm(up) - 1) < MAX_LENGTH_ERROR:
+        raise ValueError(f"up is {up}, which is no direction")
+    return np.asarray(up, float)

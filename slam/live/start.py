@@ -14,7 +14,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.network.workstation import Workstation
 from bmask_slam.live.processes.calibration_process import CalibrationSetup
-from bmask_slam.live.processes.map_worker import MapPlace
+from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.processes.remote_calibration import RemoteCalibration
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.system import LiveSystem

@@ -28,7 +28,7 @@ from bmask_slam.live.messages import (
     UseCamera,
 )
 from bmask_slam.live.processes.map_process import LabelsOnly
-from bmask_slam.live.processes.map_worker import MapPlace
+from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.processes.remote_calibration import RemoteCalibration
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter

@@ -21,7 +21,8 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import part
 from bmask_slam.labelling.mask_memory import MaskMemory
 from bmask_slam.live.messages import FramesTracked, Handled, ImageToSegment, Masks, SaveState
-from bmask_slam.live.processes.map_worker import MapPlace, MapWorker
+from bmask_slam.live.processes.map_return import MapPlace
+from bmask_slam.live.processes.map_worker import MapWorker
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy

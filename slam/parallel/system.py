@@ -13,7 +13,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import nested, part, read_arrays, write_arrays
 from bmask_slam.live.messages import STATE_FILE
 from bmask_slam.live.processes.map_process import LabelsOnly
-from bmask_slam.live.processes.map_worker import MapPlace
+from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.system import LiveSystem
 from bmask_slam.parallel.lockstep import LockstepMapper, LockstepSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions

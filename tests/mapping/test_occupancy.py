@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ruamel.yaml import YAML
+from drive_map_files import load_nav2, load_octomap
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -26,52 +26,6 @@ CAMERA = Camera(64, 48, 40.0, 40.0, 31.5, 23.5)
 R = 0.1
 # Camera z is the map's x, camera x its -y, camera y its -z.
 LOOKS_ALONG_X = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
-
-
-def load_nav2(path: Path) -> OccupancyGrid:
-    """As map_server: trinary, row 0 of the image on top, origin the lower left corner."""
-    said = YAML(typ="safe").load(path)
-    magic, size, top, data = (path.parent / said["image"]).read_bytes().split(b"\n", 3)
-    assert (magic, top, said["mode"], said["negate"]) == (b"P5", b"255", "trinary", 0)
-    width, height = map(int, size.split())
-    image = np.frombuffer(data, np.uint8).reshape(height, width)[::-1]
-    share = (255 - image.astype(float)) / 255
-    cells = np.full(image.shape, UNKNOWN, np.int8)
-    cells[share > said["occupied_thresh"]] = OCCUPIED
-    cells[share < said["free_thresh"]] = FREE
-    x, y, yaw = said["origin"]
-    assert yaw == 0
-    return OccupancyGrid(said["resolution"], np.array([x, y]), cells)
-
-
-def load_octomap(path: Path) -> tuple[int, float, dict[tuple[int, int, int], bool]]:
-    """Size, resolution and the voxels of a binary tree, by a recursion over its nodes."""
-    head, data = path.read_bytes().split(b"\ndata\n", 1)
-    lines = head.decode().splitlines()
-    assert lines[0] == "# Octomap OcTree binary file"
-    said = dict(line.split(maxsplit=1) for line in lines if not line.startswith("#"))
-    voxels: dict[tuple[int, int, int], bool] = {}
-    at, nodes = 0, 1
-
-    def read(depth: int, corner: np.ndarray) -> None:
-        nonlocal at, nodes
-        bits = data[at] | data[at + 1] << 8
-        at += 2
-        edge = 1 << (16 - depth - 1)
-        for child in range(8):
-            kind = bits >> 2 * child & 3
-            begin = corner + edge * np.array([child & 1, child >> 1 & 1, child >> 2 & 1])
-            nodes += kind > 0
-            if kind == 3:
-                read(depth + 1, begin)
-            elif kind:
-                for cell in np.ndindex(edge, edge, edge):
-                    voxels[tuple((begin + cell - (1 << 15)).tolist())] = kind == 2
-
-    read(0, np.zeros(3, int))
-    assert at == len(data)
-    assert nodes == int(said["size"])
-    return nodes, float(said["res"]), voxels
 
 
 @pytest.fixture
@@ -134,6 +88,28 @@ def test_octomap_reads_the_voxels_back(carved: VoxelMap, tmp_path: Path) -> None
         rows = zip(voxels.keys.tolist(), voxels.occupied.tolist(), strict=True)
         assert found == {tuple(key): occupied for key, occupied in rows}
     assert nodes == 14  # 512 voxels are one leaf below 13 nodes
+
+
+def test_octomaps_own_library_writes_the_same_file(carved: VoxelMap, tmp_path: Path) -> None:
+    library = pytest.importorskip("pyoctomap")
+    keys = np.unique(np.random.default_rng(0).integers(-30, 30, (5000, 3)), axis=0)
+    block = np.stack(np.meshgrid(*[np.arange(8, 16)] * 3), axis=-1).reshape(-1, 3)
+    many = np.unique(np.concatenate([keys, block]), axis=0)
+    random = VoxelMap(0.05, np.eye(4), many, many.sum(axis=1) % 5 > 2)
+    for voxels in (carved, random, VoxelMap(0.2, np.eye(4), block, np.ones(len(block), bool))):
+        ours, theirs = tmp_path / "ours.bt", tmp_path / "theirs.bt"
+        nodes = write_octomap(ours, voxels)
+        tree = library.OcTree(voxels.resolution_m)
+        places = (voxels.keys + 0.5) * voxels.resolution_m
+        for occupied in (False, True):
+            tree.updateNodes(places[voxels.occupied == occupied], occupied)
+        assert tree.writeBinary(str(theirs))
+        assert ours.read_bytes() == theirs.read_bytes()
+        read = library.OcTree(1.0)
+        assert read.readBinary(str(ours))
+        assert (read.size(), read.getResolution()) == (nodes, voxels.resolution_m)
+        states = [read.isNodeOccupied(read.search(place)) for place in places]
+        assert np.array_equal(states, voxels.occupied)
 
 
 def test_a_map_without_anything_is_refused() -> None:

@@ -22,7 +22,7 @@ from bmask_slam.live.network.connection import (
     introduce,
     read_token,
 )
-from bmask_slam.live.processes.worker import Failure
+from bmask_slam.live.processes.worker import Failure, WorkstationAwayError
 
 logger = logging.getLogger(__name__)
 
@@ -31,6 +31,7 @@ CONNECT_S = 2.0
 STOP_S = 0.1
 SILENT_S = 1.5
 """A machine that acknowledges nothing for so long is away. Much longer, and tracking is lost."""
+CURE = "does bmask-slam workstation --host ADDRESS run there?"
 
 
 @dataclass
@@ -110,7 +111,8 @@ class Workstation:
         """Start a worker there, from a file of this machine if there is one.
 
         Raises:
-            InputError: the workstation cannot be reached, or has another token or version.
+            WorkstationAwayError: the workstation cannot be reached.
+            InputError: it has another token or version, or ``host`` is no name of one.
         """
         where = f"the workstation {self.host}:{self.port}"
         try:
@@ -120,12 +122,11 @@ class Workstation:
             except BaseException:
                 end.close()
                 raise
-        except (OSError, UnicodeError) as error:  # UnicodeError: no name of a host
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(
-                f"{where} cannot be reached ({reason}); does "
-                "bmask-slam workstation --host ADDRESS run there?"
-            ) from error
+        except UnicodeError as error:
+            raise InputError(f"{where} cannot be reached ({error}); {CURE}") from error
+        except OSError as error:
+            reason = error.strerror or error
+            raise WorkstationAwayError(f"{where} cannot be reached ({reason}); {CURE}") from error
         self.traffic.add(connection)
         data = None if state is None else file_data(state)
         return DistantEnd(connection, (name, arguments, data))

@@ -1,4 +1,4 @@
-"""The way of the map's process back to a workstation that was lost.
+"""Where the map's process runs, and its way to a workstation that was lost, or away at the start.
 
 A thread waits until the workstation can be reached, lets the process of this machine save a state,
 starts one there from that, and waits until it is ready. The process here works on meanwhile; only
@@ -10,19 +10,34 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.messages import Ready
-from bmask_slam.live.processes.worker import WorkerEnd, Workstation
+from bmask_slam.live.processes.worker import WorkerEnd, Workstation, WorkstationAwayError
 
 logger = logging.getLogger(__name__)
 
 RETRY_S = 1.0
 """Between two tries to reach the workstation."""
+REFUSED_S = 60.0
+"""The same after it has refused: it has another token or version."""
 SAVE_S = START_S = 300.0
 """Longest waits for the state, and for a process there to have read it."""
+
+
+@dataclass(frozen=True)
+class MapPlace:
+    """Where the map's process runs, and the folder of its states, which is one of this machine.
+
+    Here it may begin with the state of a file, ``begins_with``.
+    """
+
+    folder: Path
+    workstation: Workstation | None = None
+    begins_with: Path | None = None
 
 
 class MapReturn:
@@ -40,7 +55,7 @@ class MapReturn:
         self.saved: int | None = None
         self._workstation, self._arguments = workstation, arguments
         self._wanted, self._has_state = threading.Event(), threading.Event()
-        self._closed = threading.Event()
+        self._closed, self._wait_s = threading.Event(), RETRY_S
         self._ready: tuple[WorkerEnd, list[Any]] | None = None
         self._thread = threading.Thread(target=self._go, name="workstation", daemon=True)
         self._thread.start()
@@ -67,7 +82,8 @@ class MapReturn:
             self._ready[0].kill()
 
     def _go(self) -> None:
-        while not self._closed.wait(RETRY_S):
+        while not self._closed.wait(self._wait_s):
+            self._wait_s = RETRY_S
             if self._workstation.is_reachable():
                 self._has_state.clear()
                 self._wanted.set()
@@ -79,8 +95,11 @@ class MapReturn:
         """Start a process there; whether it is ready."""
         try:
             end = self._workstation.worker("map", (*self._arguments, 0), self.path)
+        except WorkstationAwayError:
+            return False
         except InputError as error:
-            logger.warning("%s", error)
+            logger.warning("%s; the map stays here", error)
+            self._wait_s = REFUSED_S
             return False
         found: list[Any] = []
         for _ in range(int(START_S / 0.2)):

@@ -2,8 +2,8 @@
 
 Messages are kept in the journal until the process has saved a state that contains them. If it dies,
 a new process starts from that state and gets the later messages again; tracking goes on meanwhile.
-On a workstation it is the same; states come back over the network. When that is lost, the new
-process is one of this machine, and when it is back, the map goes there again (`map_return`).
+On a workstation it is the same; states come back over the network. While that is away, at the start
+or later, the process is one of this machine, and then the map goes there (`map_return`).
 """
 
 from __future__ import annotations
@@ -12,17 +12,21 @@ import itertools
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import Finish, Ready, Resent, SaveState, Started, StateSaved
 from bmask_slam.live.processes.map_process import serve_map
-from bmask_slam.live.processes.map_return import MapReturn
+from bmask_slam.live.processes.map_return import MapPlace, MapReturn
 from bmask_slam.live.processes.supervision import late_start_text
-from bmask_slam.live.processes.worker import Failure, Worker, WorkerEnd, Workstation
+from bmask_slam.live.processes.worker import (
+    Failure,
+    Worker,
+    WorkerEnd,
+    Workstation,
+    WorkstationAwayError,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -30,18 +34,6 @@ TARGET = "bmask_slam.live.processes.map_process:serve_map"
 STANDBY = "bmask_slam.live.processes.map_worker:serve_later"
 MAX_CRASHES = 3
 """Number of crashes after which it is not restarted, if it never got as far as before between."""
-
-
-@dataclass(frozen=True)
-class MapPlace:
-    """Where the map's process runs, and the folder of its states, which is one of this machine.
-
-    Here it may begin with the state of a file, ``begins_with``.
-    """
-
-    folder: Path
-    workstation: Workstation | None = None
-    begins_with: Path | None = None
 
 
 class MapWorker:
@@ -58,7 +50,7 @@ class MapWorker:
     def __init__(
         self, arguments: tuple[Any, ...], replacement: Callable[[Any], Any], place: MapPlace
     ) -> None:
-        """Start the process.
+        """Start the process; here, if the workstation does not answer.
 
         Args:
             arguments: of ``serve_map``, without the state.
@@ -67,7 +59,7 @@ class MapWorker:
             place: where it runs.
 
         Raises:
-            InputError: the workstation cannot be reached.
+            InputError: the workstation refuses.
         """
         self.crashes = self.losses = 0
         self._place = place
@@ -223,7 +215,7 @@ class MapWorker:
         if self._place.workstation is not None:
             if self._return is not None:
                 self._return.close()
-            self._return = MapReturn(self._place.workstation, self._arguments, self._place.folder)
+            self._return = self._way_back(self._place.workstation)
         self._send_journal(self._saved)
 
     def _send_journal(self, begin: int) -> None:
@@ -245,11 +237,20 @@ class MapWorker:
         self._worker.kill()
 
     def _first(self) -> WorkerEnd:
-        if self._place.workstation is not None:
-            there = self._place.workstation.worker("map", (*self._arguments, 0), None)
-            self._standby = Worker("map", STANDBY)
-            return there
+        workstation = self._place.workstation
+        if workstation is not None:
+            try:
+                there = workstation.worker("map", (*self._arguments, 0), None)
+            except WorkstationAwayError as error:
+                logger.warning("%s The map begins here and goes there once it answers", error)
+                self._return = self._way_back(workstation)
+            else:
+                self._standby = Worker("map", STANDBY)
+                return there
         return Worker("map", TARGET, *self._arguments, self.state, 0)
+
+    def _way_back(self, workstation: Workstation) -> MapReturn:
+        return MapReturn(workstation, self._arguments, self._place.folder)
 
     def _without_own(self, messages: list[Any]) -> list[Any]:
         """Handle the messages about the process itself; returns the others."""

@@ -11,7 +11,7 @@ import numpy as np
 from bmask_slam.back_end.map_backend import add_keyframe
 from bmask_slam.events import Event, EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex
-from bmask_slam.graph.arrays import Array, Ints, Mask
+from bmask_slam.graph.arrays import Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse
@@ -34,7 +34,8 @@ from bmask_slam.live.messages import (
     TellObjects,
     VisibilityCounts,
 )
-from bmask_slam.live.processes.map_worker import MapPlace, MapWorker
+from bmask_slam.live.processes.map_return import MapPlace
+from bmask_slam.live.processes.map_worker import MapWorker
 from bmask_slam.live.replica import apply_delta
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.semantics.instances.instances import PackedMask
@@ -256,7 +257,11 @@ class RemoteMapper:
         """The message in place of one of which two processes died, if it needs one."""
         if not isinstance(message, NewKeyframe):
             return None
-        lost = message.id, *_parent(message)
+        parent_id, T_parent_lost = NO_KEYFRAME, np.eye(4)
+        if message.reference is not None:
+            parent_id, T_world_parent = message.reference
+            T_parent_lost = inverse(T_world_parent) @ message.tracked.T_world_camera
+        lost = message.id, parent_id, T_parent_lost
         self.history.hand_over(*lost)
         return LostKeyframe(*lost, message.history, len(self.world.landmarks))
 
@@ -290,11 +295,3 @@ class RemoteMapper:
         entries = self.history.since(self._sent_frames)
         self._sent_frames += len(entries)
         return entries
-
-
-def _parent(lost: NewKeyframe) -> tuple[int, Array]:
-    """The keyframe to which a lost keyframe's frames are attached, and T_parent_lost (4, 4)."""
-    if lost.reference is None:
-        return NO_KEYFRAME, np.eye(4)
-    parent_id, T_world_parent = lost.reference
-    return parent_id, inverse(T_world_parent) @ lost.tracked.T_world_camera

@@ -14,7 +14,11 @@ from bmask_slam.live.messages import ImageToSegment, Masks, NotSegmented, Ready
 from bmask_slam.live.processes.supervision import DistantWorker, RestartPolicy, SupervisedWorker
 from bmask_slam.live.processes.worker import Workstation
 from bmask_slam.semantics.labels import LabelSet
-from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.semantics.segmenters.segmenter_table import (
+    SegmenterOptions,
+    labels_of,
+    make_segmenter,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -72,7 +76,11 @@ class RemoteSegmenter:
         policy: RestartPolicy | None = None,
         workstation: Workstation | None = None,
     ) -> None:
-        """Start the process and wait until it is ready. Raises InputError if it cannot start."""
+        """Start the process and wait until it is ready, unless the workstation is away.
+
+        Raises:
+            InputError: it cannot start, or only the workstation knows its classes and is away.
+        """
         self.dropped = 0
         self.segmentation_ms: list[float] = []
         self._requested: dict[int, ImageToSegment] = {}
@@ -85,7 +93,19 @@ class RemoteSegmenter:
             target = f"{__name__}:serve_segmenter"
             here = (*arguments, self.niceness)
             self.worker = SupervisedWorker(name, target, here, policy or RestartPolicy())
-        self.labels = LabelSet(self.worker.wait_until_ready().labels)
+        try:
+            self.labels = self._known_labels(options, sequence)
+        except InputError:
+            self.worker.close()
+            raise
+
+    def _known_labels(self, options: SegmenterOptions, sequence: Path) -> LabelSet:
+        if not self.worker.is_away:
+            return LabelSet(self.worker.wait_until_ready().labels)
+        try:
+            return labels_of(options, sequence)
+        except InputError as error:
+            raise InputError(f"the workstation does not answer, and without it: {error}") from error
 
     @property
     def waiting(self) -> int:
@@ -107,8 +127,12 @@ class RemoteSegmenter:
 
     def receive_masks(self) -> list[Masks]:
         """The masks that have come. A process that died or hangs is restarted."""
-        found = []
-        for message in self.worker.receive():
+        found: list[Masks] = []
+        messages = self.worker.receive()
+        if self.worker.labels not in ((), self.labels.names):
+            self._refuse_masks()
+            messages = []
+        for message in messages:
             self._requested.pop(message.keyframe_id, None)
             match message:
                 case Masks():
@@ -122,6 +146,11 @@ class RemoteSegmenter:
         if self.worker.given_up:
             self._requested.clear()
         return found
+
+    def _refuse_masks(self) -> None:
+        if not self.worker.given_up:
+            logger.error("the workstation's segmenter has other classes; its masks are not used")
+            self.worker.give_up()
 
     def _not_segmented(self, message: NotSegmented) -> None:
         self.dropped += 1

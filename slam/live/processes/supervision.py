@@ -12,8 +12,15 @@ from typing import Any
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.messages import Ready
-from bmask_slam.live.processes.map_return import RETRY_S
-from bmask_slam.live.processes.worker import Failure, Worker, WorkerEnd, Workstation
+from bmask_slam.live.processes.map_return import REFUSED_S, RETRY_S
+from bmask_slam.live.processes.worker import (
+    Failure,
+    NoEnd,
+    Worker,
+    WorkerEnd,
+    Workstation,
+    WorkstationAwayError,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -53,7 +60,11 @@ class SupervisedWorker:
         name: of the worker, for messages.
         crashes: how often a process died or hung.
         arguments: of a process that is started in its place.
+        labels: of its last ``Ready``; empty before.
+        is_away: whether it is on another machine, which cannot be reached at present.
     """
+
+    is_away = False
 
     def __init__(
         self, name: str, target: str, arguments: tuple[Any, ...], policy: RestartPolicy
@@ -62,7 +73,7 @@ class SupervisedWorker:
         self.crashes = 0
         self._target, self.arguments, self._policy = target, arguments, policy
         self._heard_s, self._used_s = time.monotonic(), 0.0
-        self._is_ready = False
+        self._is_ready, self.labels = False, tuple[str, ...]()
         self._worker = self._start()
 
     @property
@@ -87,7 +98,7 @@ class SupervisedWorker:
             for message in self._worker.receive(0.1):
                 match message:
                     case Ready():
-                        self._is_ready = True
+                        self._is_ready, self.labels = True, message.labels
                         return message
                     case Failure():
                         self.close()
@@ -114,6 +125,8 @@ class SupervisedWorker:
         for message in messages:
             if isinstance(message, Failure):
                 logger.error("the %s failed: %s", self.name, message.text)
+            elif isinstance(message, Ready):
+                self.labels = message.labels
         return [m for m in messages if not isinstance(m, Failure | Ready)]
 
     def restart_if_needed(self, busy: bool) -> bool:
@@ -136,6 +149,11 @@ class SupervisedWorker:
         """End the process at once."""
         self._worker.kill()
 
+    def give_up(self) -> None:
+        """End it at once, and do not start it again."""
+        self.crashes = self._policy.restarts + 1
+        self.close()
+
     def _hangs(self) -> bool:
         """Whether it has been silent for too long for one that has work."""
         silent_s = time.monotonic() - self._heard_s
@@ -155,13 +173,13 @@ class SupervisedWorker:
 
 
 class DistantWorker(SupervisedWorker):
-    """A worker on a workstation. When that is lost, it is begun again as soon as that is back.
+    """A worker on a workstation. When that is away, it is begun as soon as that is back.
 
     Only failures of its own count as crashes.
     """
 
     def __init__(self, name: str, arguments: tuple[Any, ...], workstation: Workstation) -> None:
-        """Start it. Raises InputError if the workstation cannot be reached."""
+        """Start it, or later if the workstation does not answer. Raises InputError: it refuses."""
         self._workstation = workstation
         self._back: queue.SimpleQueue[WorkerEnd] = queue.SimpleQueue()
         self._closed, self.is_away = threading.Event(), False
@@ -185,8 +203,7 @@ class DistantWorker(SupervisedWorker):
             logger.error("the %s died %d times; it is not restarted", self.name, self.crashes)
             return False
         logger.warning("the workstation's %s is lost; it is tried again", self.name)
-        self.is_away = True
-        threading.Thread(target=self._wait_for_it, name="workstation", daemon=True).start()
+        self._look_for_it()
         return False
 
     def close(self) -> None:
@@ -196,12 +213,22 @@ class DistantWorker(SupervisedWorker):
         with suppress(queue.Empty):
             self._back.get_nowait().kill()
 
+    def _look_for_it(self) -> None:
+        self.is_away = True
+        threading.Thread(target=self._wait_for_it, name="workstation", daemon=True).start()
+
     def _wait_for_it(self) -> None:
-        while not self._closed.wait(RETRY_S):
+        wait_s = RETRY_S
+        while not self._closed.wait(wait_s):
             try:
-                end = self._start()
-            except InputError as error:
+                end = self._there()
+            except WorkstationAwayError as error:
                 logger.debug("%s", error)
+                wait_s = RETRY_S
+                continue
+            except InputError as error:
+                logger.warning("%s; the %s is not used", error, self.name)
+                wait_s = REFUSED_S
                 continue
             self._back.put(end)
             if self._closed.is_set():
@@ -209,4 +236,12 @@ class DistantWorker(SupervisedWorker):
             return
 
     def _start(self) -> WorkerEnd:
+        try:
+            return self._there()
+        except WorkstationAwayError as error:  # the map's worker says so
+            logger.info("%s", error)
+            self._look_for_it()
+            return NoEnd()
+
+    def _there(self) -> WorkerEnd:
         return self._workstation.worker(self.name, self.arguments, None)

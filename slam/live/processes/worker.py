@@ -61,6 +61,23 @@ class WorkerEnd(Protocol):
     def kill(self) -> None: ...
 
 
+class NoEnd:
+    """Of a worker that has not been started yet: what is sent to it is lost."""
+
+    pid, processor_s, is_running, was_killed = 0, 0.0, False, True
+
+    def send(self, message: Any) -> None: ...
+    def receive(self, timeout_s: float = 0.0) -> list[Any]:
+        return []
+
+    def stop(self, timeout_s: float = 5.0) -> None: ...
+    def kill(self) -> None: ...
+
+
+class WorkstationAwayError(InputError):
+    """The workstation does not answer; it may later."""
+
+
 class Traffic(Protocol):
     """Bytes to a workstation and from it."""
 
@@ -80,7 +97,8 @@ class Workstation(Protocol):
         """Start one by its name, from a file of this machine if there is one.
 
         Raises:
-            InputError: the machine cannot be reached, or refuses.
+            WorkstationAwayError: the machine cannot be reached.
+            InputError: it refuses.
         """
 
     def is_reachable(self) -> bool:

@@ -16,7 +16,11 @@ from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.network.boxes import iou
 from bmask_slam.semantics.network.yolox.network import Features
 from bmask_slam.semantics.segmenters.light_segmenter import LightSegmenter
-from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.semantics.segmenters.segmenter_table import (
+    SegmenterOptions,
+    labels_of,
+    make_segmenter,
+)
 from bmask_slam.semantics.weights.light_weights import (
     LightNetwork,
     is_light,
@@ -100,6 +104,8 @@ def test_a_saved_network_is_found_by_its_file(
     options = SegmenterOptions("light", str(path), labels=str(labels), min_score=0.3)
     segmenter = make_segmenter(options, tmp_path)
     assert segmenter.labels.names[1:] == ("drone", "chair", "dining table", "bowl")
+    assert labels_of(options, tmp_path) == segmenter.labels
+    assert labels_of(SegmenterOptions(), tmp_path) == load_light(path).labels
     expected = LightSegmenter(LightNetwork(network.model, segmenter.labels), 0.3)
     pairs = zip(
         segmenter.segment(photograph, "a.jpg"), expected.segment(photograph, "a.jpg"), strict=True

@@ -13,6 +13,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from drive_map_files import load_nav2
+from ruamel.yaml import YAML
 from scipy.spatial import cKDTree
 from true_run import FRAMES, make_run
 
@@ -32,9 +34,11 @@ from bmask_slam.graph.files.ply import read_ply, write_ply
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.mapping.products.cloud import Cloud
+from bmask_slam.mapping.products.occupancy import OCCUPIED
 from bmask_slam.mapping.products.submaps import read_submap, write_submap
 from bmask_slam.rendering.sequence import RenderConfig
 from bmask_slam.run_folder.map_file import read_map, write_map
+from bmask_slam.run_folder.reader import Run
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.segmenters.segmenter import CocoSegmenter
 from bmask_slam.sequences.sequence import open_sequence
@@ -536,18 +540,26 @@ def test_evidence_of_other_classes_landmarks_or_instances_is_refused(
         KeyframeEvidence(fused).table(None)
 
 
+WITHOUT_CHAIR = ["--voxel", "0.03", "--segmenter", "truth", "--without", "chair", "--moving"]
+
+
+@pytest.fixture(scope="module")
+def without_chair(mapped: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("left_out") / "run"
+    shutil.copytree(mapped, run)
+    assert main(["map", str(run), *WITHOUT_CHAIR, "--quiet"]) == 0
+    return run
+
+
 def test_excluded_points_of_an_instance_that_is_not_there_are_refused(
-    mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    without_chair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"
-    shutil.copytree(mapped, run)
-    arguments = ["map", str(run), "--voxel", "0.05", "--segmenter", "truth", "--without", "chair"]
-    arguments += ["--moving", "--quiet"]
-    assert main(arguments) == 0
+    shutil.copytree(without_chair, run)
     path = next(p for p in sorted((run / "dense" / "moving").iterdir()) if len(read_submap(p)))
     submap = read_submap(path)
     write_submap(path, replace(submap, instances=np.full_like(submap.instances, 60000)))
-    assert main(arguments) == 1
+    assert main(["map", str(run), *WITHOUT_CHAIR]) == 1
     assert f"moving/{path.name}: its arrays do not fit together" in capsys.readouterr().err
 
 
@@ -565,3 +577,33 @@ def test_a_map_to_drive_on_that_is_too_large_by_a_few_points_is_refused(
     write_ply(run / "dense" / "cloud.ply", cloud)
     assert main(arguments) == 1
     assert "m large; choose a larger --resolution" in capsys.readouterr().err
+
+
+def occupied_share(run: Path, yaml: Path, points_world: Array) -> float:
+    """Share of occupied cells among those of points (N, 3) from 0.1 to 1.5 m above the floor."""
+    arguments = ["export", str(run), "--format", "nav2", "--out", str(yaml), "--quiet"]
+    assert main([*arguments, "--resolution", "0.1"]) == 0  # of points 3 cm apart
+    grid = load_nav2(yaml)
+    T_map_world = np.array(YAML(typ="safe").load(yaml)["bmask_slam_T_map_world"])
+    placed = transform(T_map_world, points_world)
+    placed = placed[(placed[:, 2] > 0.15) & (placed[:, 2] < 1.4)]
+    columns, rows = np.floor((placed[:, :2] - grid.origin_m) / grid.resolution_m).astype(int).T
+    inside = (rows >= 0) & (columns >= 0)
+    inside &= (rows < grid.cells.shape[0]) & (columns < grid.cells.shape[1])
+    cells = np.unique(np.stack([rows, columns], axis=1)[inside], axis=0)
+    return float((grid.cells[tuple(cells.T)] == OCCUPIED).sum() / len(cells))
+
+
+def test_what_is_left_out_of_the_map_is_no_obstacle(
+    mapped: Path, without_chair: Path, tmp_path: Path
+) -> None:
+    """A chair; the desk stays but near the chair, whose masks are widened by some of the pixels."""
+    cloud, shares = Run(mapped).dense_cloud, {}
+    for run in (mapped, without_chair):
+        for name in ("chair", "desk"):
+            points = cloud.points_world[cloud.labels == name]
+            shares[run, name] = occupied_share(run, tmp_path / "map.yaml", points)
+    assert shares[mapped, "chair"] > 0.7
+    assert shares[without_chair, "chair"] < 0.1
+    assert shares[mapped, "desk"] > 0.9
+    assert shares[without_chair, "desk"] > 0.5

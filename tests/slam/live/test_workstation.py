@@ -19,19 +19,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from feeding import track_frames
 from synthetic_view import CAMERA
-from test_live_faults import label_image
+from test_live_faults import CONFIG, FRAMES, label_image
 from test_map_process import keyframe
 
 from bmask_slam.cli import main
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import read_arrays
 from bmask_slam.live.channel import END
+from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.messages import (
     STATE_FILE,
     Finish,
     ImageToSegment,
     MapSaved,
+    Masks,
     Ready,
     Resent,
     SaveMap,
@@ -53,10 +56,15 @@ from bmask_slam.live.network.server import WorkstationServer
 from bmask_slam.live.network.workstation import Workstation
 from bmask_slam.live.processes import map_return, map_worker, supervision
 from bmask_slam.live.processes.map_process import MapServer
-from bmask_slam.live.processes.map_worker import MapPlace, MapWorker
+from bmask_slam.live.processes.map_return import MapPlace
+from bmask_slam.live.processes.map_worker import MapWorker
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
+from bmask_slam.live.processes.worker import WorkstationAwayError
+from bmask_slam.semantics.labels import read_label_set
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import TrackingStatus
 from bmask_slam.world.frame_history import ENTRY
 
 TOKEN = b"a token for the tests only"
@@ -377,8 +385,14 @@ class Away:
     there: list[End]
     here: list[End]
     away: bool = False
+    refusals: int = 0
 
-    def worker(self, name: str, arguments: Any, state: Path | None) -> End:
+    def worker(self, name: str, arguments: Any, state: Path | None = None) -> End:
+        if self.refusals and not self.away:
+            self.refusals -= 1
+            raise InputError(f"another token, {name}")
+        if self.away:
+            raise WorkstationAwayError("away")
         self.there.append(End(name, arguments, state))
         return self.there[-1]
 
@@ -459,6 +473,64 @@ def test_a_failure_there_counts_and_the_end_stays_here(machines, tmp_path: Path)
     assert len(machines.here[0].sent) == 3
 
 
+def test_a_refusal_later_is_said_and_tried_again(machines, tmp_path, monkeypatch, caplog) -> None:
+    """At the start it ends the program."""
+    for module in (map_return, supervision):
+        monkeypatch.setattr(module, "REFUSED_S", 0.02)
+    machines.refusals = 2
+    with pytest.raises(InputError, match="another token, map"):
+        MapWorker((), lambda message: None, MapPlace(tmp_path, machines))
+    with pytest.raises(InputError, match="another token, segmenter"):
+        RemoteSegmenter(SegmenterOptions(), tmp_path, workstation=machines)
+    machines.away = True
+    segmenter = RemoteSegmenter(SegmenterOptions(), tmp_path, workstation=machines)
+    machines.refusals, machines.away = 2, False
+    with closing(segmenter):
+        until(lambda: segmenter.receive_masks() or not segmenter.worker.is_away)
+    assert caplog.text.count("another token, segmenter; the segmenter is not used") == 2
+    machines.away = True
+    worker = MapWorker((), lambda message: None, MapPlace(tmp_path, machines))
+    here = machines.here[0]
+    machines.refusals, machines.away = 2, False
+
+    def step() -> bool:
+        worker.receive()
+        here.answers += [StateSaved(number, message.path) for number, message in here.sent]
+        here.sent.clear()
+        return len(machines.there) > 1
+
+    until(step)
+    assert caplog.text.count("another token, map; the map stays here") == 2
+    machines.there[-1].answers.append(Ready())
+    until(lambda: worker.receive() or worker.workstation == "connected")
+    assert (worker.losses, here.is_running) == (0, False)
+    worker.kill()
+
+
+def test_masks_of_other_classes_are_not_used(machines, tmp_path: Path, caplog) -> None:
+    """The workstation was away at the start, and its files name other classes than ours."""
+    machines.away = True
+    network = SegmenterOptions("mask-scoring-rcnn", weights="some.pth")
+    with pytest.raises(InputError, match=r"does not answer.*--labels"):
+        RemoteSegmenter(network, tmp_path, workstation=machines)
+    for others in ((), ("plant",)):
+        machines.away = True
+        options = replace(network, labels="paper")
+        with closing(RemoteSegmenter(options, tmp_path, workstation=machines)) as segmenter:
+            assert segmenter.worker.is_away
+            names = read_label_set("paper").names
+            assert segmenter.labels.names == names
+            segmenter.request(ImageToSegment(0, np.zeros((4, 4, 3), np.uint8), "a.png"))
+            machines.away = False
+            until(lambda s=segmenter: s.receive_masks() or not s.worker.is_away)
+            there = machines.there[-1]
+            assert [m.keyframe_id for m in there.sent] == [0]
+            there.answers += [Ready((*names, *others)), Masks(0, [], 1.0)]
+            assert len(segmenter.receive_masks()) == (not others)
+            assert segmenter.worker.given_up == bool(others) != there.is_running
+            assert (segmenter.waiting, "has other classes" in caplog.text) == (0, bool(others))
+
+
 # --- with processes ------------------------------------------------------------------------------
 
 
@@ -519,6 +591,32 @@ def test_the_same_map_as_here_also_after_the_workstation_was_lost(
     assert worker.losses == 1
 
 
+def test_a_workstation_may_come_after_the_start(cut, tmp_path, monkeypatch, caplog) -> None:
+    monkeypatch.setattr(map_return, "RETRY_S", 0.1)
+    monkeypatch.setattr(supervision, "RETRY_S", 0.1)
+    semantics = replace(CONFIG.semantics, segmenter=label_image(tmp_path))
+    config = replace(CONFIG, semantics=semantics)
+    with pytest.raises(InputError, match="another token"):
+        LiveSlam(CAMERA, config, LiveOptions(workstation=workstation(cut, b"a wrong token" * 2)))
+    cut.away = True
+    caplog.clear()
+    with LiveSlam(CAMERA, config, LiveOptions(workstation=workstation(cut))) as slam:
+        (said,) = [r.message for r in caplog.records if r.levelname == "WARNING"]
+        assert said.startswith(f"the workstation 127.0.0.1:{cut.port} cannot be reached (")
+        assert said.endswith("there? The map begins here and goes there once it answers")
+        assert set(track_frames(slam, FRAMES[:6])) == {TrackingStatus.OK}
+        assert slam.health().workstation == "away"
+        assert slam._system.remote.world.landmarks.in_map.any()
+        cut.away = False
+        until(lambda: slam.catch_up() or slam.health().workstation == "connected")
+        assert set(track_frames(slam, FRAMES[6:12])) == {TrackingStatus.OK}
+        until(lambda: slam.catch_up() or not slam.health().masks_waiting)
+        health = slam.health()
+        assert (health.workstation_losses, health.map_deaths, health.segmenter_deaths) == (0, 0, 0)
+        assert len(slam._system.segmenter.segmentation_ms) == slam.health().keyframes > 1
+    assert "is there again" in caplog.text
+
+
 def test_masks_come_from_the_workstation_and_later_if_it_was_away(
     cut, tmp_path, monkeypatch
 ) -> None:
@@ -535,7 +633,7 @@ def test_masks_come_from_the_workstation_and_later_if_it_was_away(
         segmenter.request(ImageToSegment(0, image, "a.png"))
         until(lambda: step() or 0 in found)
         cut.cut()
-        until(lambda: step() or segmenter.worker.is_away)  # type: ignore[attr-defined]
+        until(lambda: step() or segmenter.worker.is_away)
         for number in range(1, 9):
             segmenter.request(ImageToSegment(number, image, "a.png"))
         assert segmenter.worker.crashes == 0

@@ -10,6 +10,7 @@ import pytest
 from synthetic_view import CAMERA, render_or_black
 
 from bmask_slam.config.configuration import resolve
+from bmask_slam.dense.saved_map import read_saved_map
 from bmask_slam.events import Event, EventKind
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_update import GraphUpdate
@@ -101,9 +102,13 @@ def test_the_imu_alone_gives_the_pose_of_a_covered_camera_for_a_second(
 
 
 def test_gravity_and_biases_are_found(
-    bridged: tuple[SlamSystem, SlamSystem, list[FrameResult]],
+    bridged: tuple[SlamSystem, SlamSystem, list[FrameResult]], tmp_path: Path
 ) -> None:
     """In the world, the first camera's; a wrong mounting or sign turns both."""
+    bridged[0].save_map(tmp_path / "map")
+    up_world = read_saved_map(tmp_path).up_world
+    assert up_world is not None
+    np.testing.assert_allclose(up_world, R_UPRIGHT_WORLD.T @ [0, 0, 1], atol=0.01)
     inertial = bridged[0].mapper.smoother.tables.inertial
     assert len(inertial.factors) > 15
     np.testing.assert_allclose(inertial.down[0], R_UPRIGHT_WORLD.T @ [0, 0, -1], atol=0.01)

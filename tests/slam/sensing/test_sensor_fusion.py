@@ -10,12 +10,15 @@ import pytest
 from synthetic_view import CAMERA, render_or_black
 
 from bmask_slam.config.configuration import resolve
+from bmask_slam.dense.saved_map import read_saved_map
 from bmask_slam.events import EventKind
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.factors.graph_update import reference_frame_id
+from bmask_slam.graph.factors.graph_update import GRAVITY, reference_frame_id
+from bmask_slam.graph.files.array_file import read_arrays, write_arrays
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, se3_log, so3_exp
 from bmask_slam.graph.sensors.mounting import T_of
+from bmask_slam.run_folder.map_file import MAP_FILE
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import TrackingStatus
@@ -117,6 +120,21 @@ def test_the_local_frame_is_where_it_was_put(
         factors = tables.relative_poses(kind)
         assert len(factors) > 5, kind
         assert system.mapper.smoother.relative_pose_errors(kind).chi2.max() < 20, kind
+
+
+def test_a_saved_map_says_where_up_is(
+    reckoned: tuple[SlamSystem, list[TrackingStatus]], tmp_path: Path
+) -> None:
+    """By the accelerometer alone: positions would give the frame a z too, but not gravity's."""
+    reckoned[0].save_map(tmp_path / "map")
+    found = read_saved_map(tmp_path).up_world
+    assert found is not None
+    np.testing.assert_allclose(found, T_ENU_PLANE[2, :3], atol=0.02)
+    header, state = read_arrays(tmp_path / "map", MAP_FILE)
+    kinds = state["mapper.graph.pose_factor_kinds"]
+    kinds[kinds == GRAVITY] = "odometry"
+    write_arrays(tmp_path / "map", MAP_FILE, header, state)
+    assert read_saved_map(tmp_path).up_world is None
 
 
 def test_a_restored_system_goes_on_identically_with_sensors() -> None:

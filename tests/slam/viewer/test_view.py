@@ -6,14 +6,16 @@ import json
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from fake_run import FakeSystem, make_sequence
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from synthetic_view import CAMERA, PlaneViews, make_features
 
 from bmask_slam.cli import main
-from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.live.display import Display
@@ -22,8 +24,11 @@ from bmask_slam.live.processes.dense_messages import Preview
 from bmask_slam.offline import runner
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.run_folder.frame_file import read_frames
+from bmask_slam.semantics.objects.boxes3d import OrientedBox
+from bmask_slam.tracking.results import FrameResult, TrackingStatus
 from bmask_slam.viewer.replay_pictures import ReplayPictures
 from bmask_slam.viewer.scene import Scene, ViewOptions
+from bmask_slam.viewer.shown import ENLARGED, Box, Ellipsoid
 from bmask_slam.world.world_map import WorldMap
 
 RrdReader = pytest.importorskip("rerun.chunk").RrdReader
@@ -107,7 +112,7 @@ def test_a_run_whose_masks_lack_images_is_shown_without_them(tmp_path, caplog) -
     assert entities(tmp_path / "a.rrd")["/world/camera/image"] == len(frames)
 
 
-def columns(path: Path, entity: str, name: str) -> list[Array]:
+def columns(path: Path, entity: str, name: str) -> list[NDArray[Any]]:
     """Rows of one component of an entity in a recording."""
     found = []
     for chunk in RrdReader(path).stream().to_chunks():
@@ -117,7 +122,7 @@ def columns(path: Path, entity: str, name: str) -> list[Array]:
         for k, field in enumerate(batch.schema):
             if field.name.endswith(name):
                 rows = [row for row in batch.column(k).to_pylist() if row]
-                found += [np.array(row, float) for row in rows]
+                found += [np.array(row) for row in rows]
     return found
 
 
@@ -148,3 +153,51 @@ def test_submaps_are_at_their_keyframes_and_move_with_them(tmp_path) -> None:
     np.testing.assert_allclose(shown[0].reshape(-1, 3), points)
     assert columns(tmp_path / "a.rrd", "/world/submaps/1", "Clear:is_recursive")
     assert not columns(tmp_path / "a.rrd", "/world/submaps/2", "Points3D:positions")
+
+
+def shapes(path: Path, entity: str, kind: str) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Centres (N, 3), rotations (N, 3, 3) and half sizes (N, 3) of what an entity showed first."""
+    parts = ("centers", "quaternions", "half_sizes")
+    centres, quaternions, half_sizes = (columns(path, entity, f"{kind}:{n}")[0] for n in parts)
+    return centres, Rotation.from_quat(quaternions).as_matrix(), half_sizes
+
+
+def test_objects_have_boxes_and_names(tmp_path: Path) -> None:
+    path, T = tmp_path / "a.rrd", [se3_exp(np.array([0.3, 0.5, -0.2, k, 2.0, 3.0])) for k in (1, 4)]
+    sizes = [np.array([0.2, 0.4, 0.6]), np.array([1.0, 0.8, 0.1])]
+    texts, colours = ["chair 0.90", "desk 0.70"], np.array([[9, 8, 7], [200, 0, 3]], np.uint8)
+    boxes = map(OrientedBox, T, sizes)
+    scene = Scene("a", ViewOptions(record=path))
+    scene.log_boxes(list(map(Box, boxes, texts, colours)))
+    scene.close()
+    centres, rotations, half_sizes = shapes(path, "/world/objects", "Boxes3D")
+    np.testing.assert_allclose(centres, [one[:3, 3] for one in T], atol=1e-6)
+    np.testing.assert_allclose(rotations, [one[:3, :3] for one in T], atol=1e-6)
+    np.testing.assert_allclose(half_sizes, np.array(sizes) / 2, atol=1e-6)
+    assert columns(path, "/world/objects", "Boxes3D:labels")[0].tolist() == texts
+    assert columns(path, "/world/objects", "Boxes3D:show_labels")[0].all()
+    shown = columns(path, "/world/objects", "Boxes3D:colors")[0]
+    assert (shown >> 8).tolist() == [(r << 16) + (g << 8) + b for r, g, b in colours.tolist()]
+
+
+def test_ellipsoids_are_those_of_the_covariances(tmp_path: Path) -> None:
+    """Of keyframes in the world, and of the camera in itself; 3 sigma, enlarged."""
+    path, rng = tmp_path / "a.rrd", np.random.default_rng(3)
+    factors = rng.normal(0, 0.003, (3, 3, 3))
+    covariances, centres = factors @ factors.mT + 1e-7 * np.eye(3), rng.normal(size=(3, 3))
+    whole = np.diag([1e-4] * 6)
+    whole[3:, 3:] = covariances[0]
+    scene = Scene("a", ViewOptions(record=path))
+    shown = [Ellipsoid.of(*one) for one in zip(centres, covariances, strict=True)]
+    scene.log_ellipsoids("world/uncertainty", shown)
+    information = np.linalg.inv(whole)
+    scene.log_frame(FrameResult(0, 0.0, TrackingStatus.OK, np.eye(4), information=information))
+    scene.close()
+    for entity, where, expected in (
+        ("/world/uncertainty", centres, covariances),
+        ("/world/camera/uncertainty", np.zeros((1, 3)), covariances[:1]),
+    ):
+        found, R, half_sizes = shapes(path, entity, "Ellipsoids3D")
+        np.testing.assert_allclose(found, where, atol=1e-6)
+        squares = R @ (half_sizes[:, :, None] ** 2 * R.mT)
+        np.testing.assert_allclose(squares / (3 * ENLARGED) ** 2, expected, atol=1e-9)

@@ -1,9 +1,16 @@
-"""``--serve`` in a real Chromium: the printed address shows the map, the image, masks and plots."""
+"""``view RUN --serve`` in Chromium: the printed address shows map, image, masks and plots."""
 
 from __future__ import annotations
 
+import re
+import shutil
+import signal
 import socket
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -11,13 +18,11 @@ import numpy as np
 import pytest
 from chromium import DRAWING, EXECUTABLE, chromium
 
+from bmask_slam.cli import main
 from bmask_slam.graph.arrays import Image
-from bmask_slam.graph.camera import Camera
-from bmask_slam.semantics.instances.instances import Instance
-from bmask_slam.tracking.results import FrameResult, TrackingStatus
-from bmask_slam.viewer.options import ViewOptions
-from bmask_slam.viewer.scene import Scene
-from bmask_slam.viewer.shown import as_jpeg
+from bmask_slam.graph.files.ply import write_ply
+from bmask_slam.run_folder.frame_file import read_frames
+from bmask_slam.sequences.sequence import open_sequence
 
 pytest.importorskip("rerun_cli")
 pytestmark = pytest.mark.skipif(
@@ -35,30 +40,52 @@ def free_port() -> int:
         return int(server.getsockname()[1])
 
 
-def fill(scene: Scene) -> None:
-    """A wall of green landmarks, an orange image, and a keyframe of blue with a mask on it."""
-    camera = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-    scene.log_camera(camera)
-    scene.log_names(["unknown", "chair"])
-    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-1, 1, 60)), -1).reshape(-1, 2)
-    wall = np.column_stack([grid, np.full(len(grid), 3.0)])
-    scene.set_time(0.0)
-    scene.log_points("world/landmarks", wall, np.tile(np.uint8(GREEN), (len(wall), 1)), 0.02)
-    images = [np.full((480, 640, 3), colour, np.uint8) for colour in (ORANGE, BLUE)]
-    for k in range(12):
-        T = np.eye(4)
-        T[0, 3] = 0.05 * k
-        times = {"tracking": 10.0 + k}
-        scene.log_frame(
-            FrameResult(k, k / 30, TrackingStatus.OK, T, information=1e4 * np.eye(6),
-                        stage_ms=times), images[0]
-        )  # fmt: skip
-    mask = np.zeros((480, 640), bool)
-    mask[100:300, 100:400] = True
-    box, surely = np.array([100.0, 100, 400, 300]), np.array([0.1, 0.9])
-    scene.log_masks(
-        as_jpeg(images[1]), [Instance(mask, box, 1, surely, 0.9, 0.9)], ["unknown", "chair"]
+@pytest.fixture
+def shown(office: Path, tmp_path: Path) -> tuple[Path, Path]:
+    """A run and its sequence: keyframes became blue, other frames orange; a dense green wall."""
+    run, sequence = tmp_path / "run", tmp_path / "office"
+    shutil.copytree(office, sequence)
+    arguments = ["--segmenter", "truth", "--calibrate", "off", "--out", str(run), "--quiet"]
+    assert main(["run", str(sequence), *arguments]) == 0
+    images = open_sequence(sequence).pairs.rgb_files
+    keyframes = read_frames(run / "frames.csv").keyframe_ids >= 0
+    assert keyframes.any()
+    assert not keyframes[-1]  # which is what the camera's view shows at the end
+    for file, is_keyframe in zip(images, keyframes, strict=True):
+        image = np.full_like(cv2.imread(str(file)), (BLUE if is_keyframe else ORANGE)[::-1])
+        cv2.imwrite(str(file), image)
+    side = np.linspace(-0.75, 0.75, 250)  # at 6 mm its points, of 12 mm, cover it
+    x, y = (values.ravel().astype(np.float32) for values in np.meshgrid(side, side))
+    wall = dict(zip("xyz", (x, y, np.full_like(x, 3.0)), strict=True))
+    colour = {
+        name: np.full(x.shape, value, np.uint8)
+        for name, value in zip(("red", "green", "blue"), GREEN, strict=True)
+    }
+    (run / "dense").mkdir()
+    write_ply(run / "dense" / "cloud.ply", wall | colour)
+    return run, sequence
+
+
+@contextmanager
+def viewed(run: Path, sequence: Path) -> Iterator[str]:
+    """The address that the command prints, while it goes on; then it is ended by Ctrl-C."""
+    port = free_port()
+    command = [sys.executable, "-m", "bmask_slam", "view", str(run), "--serve", str(port)]
+    process = subprocess.Popen(
+        [*command, "--sequence", str(sequence)], stdout=subprocess.PIPE, text=True
     )
+    assert process.stdout is not None
+    try:
+        line = process.stdout.readline()
+        found = re.fullmatch(r"in a browser: (http://127\.0\.0\.1:(\d+)\?url=\S+)  \(.*\)\n", line)
+        assert found, line
+        assert found[2] == str(port)
+        yield found[1]
+        assert process.poll() is None
+    finally:
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+        process.stdout.close()
 
 
 def share_of(picture: Image, view: tuple[int, int, int, int], colour: tuple[int, ...]) -> float:
@@ -68,23 +95,19 @@ def share_of(picture: Image, view: tuple[int, int, int, int], colour: tuple[int,
     return float((off < 45).mean())
 
 
-def test_the_address_shows_the_map_the_image_and_the_masks(tmp_path: Path) -> None:
-    scene = Scene("browser", ViewOptions(serve=free_port()))
-    try:
-        fill(scene)
-        assert scene.addresses == [f"in a browser: {scene.url}"]
-        shot, shares = tmp_path / "viewer.png", [0.0]
-        with chromium(tmp_path / "profile", DRAWING) as browser:
-            browser.go(scene.url, *SIZE)
-            end_s = time.monotonic() + DRAWN_S
-            while min(shares) < 0.01 and time.monotonic() < end_s:
-                time.sleep(0.5)
-                browser.screenshot(shot)
-                picture = cv2.cvtColor(cv2.imread(str(shot)), cv2.COLOR_BGR2RGB)
-                wanted = ((MAP, GREEN), (CAMERA, ORANGE), (KEYFRAME, BLUE))
-                shares = [share_of(picture, view, colour) for view, colour in wanted]
-        assert min(shares) >= 0.01, f"green, orange and blue in their views: {shares}"
-        plots = picture[560:770, :960]
-        assert (plots.max(axis=2).astype(int) - plots.min(axis=2) > 60).mean() > 0.001
-    finally:
-        scene.close()
+def test_the_printed_address_shows_the_map_the_image_and_the_masks(
+    shown: tuple[Path, Path], tmp_path: Path
+) -> None:
+    shot, shares = tmp_path / "viewer.png", [0.0]
+    with viewed(*shown) as url, chromium(tmp_path / "profile", DRAWING) as browser:
+        browser.go(url, *SIZE)
+        end_s = time.monotonic() + DRAWN_S
+        while min(shares) < 0.01 and time.monotonic() < end_s:
+            time.sleep(0.5)
+            browser.screenshot(shot)
+            picture = cv2.cvtColor(cv2.imread(str(shot)), cv2.COLOR_BGR2RGB)
+            wanted = ((MAP, GREEN), (CAMERA, ORANGE), (KEYFRAME, BLUE))
+            shares = [share_of(picture, view, colour) for view, colour in wanted]
+    assert min(shares) >= 0.01, f"green, orange and blue in their views: {shares}"
+    plots = picture[560:770, :960]
+    assert (plots.max(axis=2).astype(int) - plots.min(axis=2) > 60).mean() > 0.001

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
 
 import pytest
 
+from bmask_slam.cli import main
 from bmask_slam.graph.errors import InputError
+from bmask_slam.live.play import play
 from bmask_slam.viewer.web_viewer import WebViewer
 
 rerun_cli = pytest.importorskip("rerun_cli")
@@ -59,6 +64,28 @@ def test_a_taken_port_is_one_line() -> None:
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"port {port} of 127"):
             WebViewer(rerun_cli, "127.0.0.1", port)
+
+
+def test_live_prints_an_address_that_answers_while_it_runs(
+    office: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """As ``view --serve`` does, whose address a browser opens in test_viewer_in_browser."""
+    port, answers = free_port(), []
+
+    def open_first(*arguments: Any) -> Any:
+        printed = capsys.readouterr().err
+        found = re.search(r"^in a browser: (http://127\.0\.0\.1:(\d+)\?url=\S+)$", printed, re.M)
+        assert found, printed
+        with urlopen(found[1], timeout=60) as page:
+            answers.append((int(found[2]), b"Rerun" in page.read()))
+        return play(*arguments)
+
+    monkeypatch.setattr("bmask_slam.live.play.play", open_first)
+    arguments = ["--segmenter", "none", "--calibrate", "off", "--max-frames", "2", "--quiet"]
+    given = ["live", str(office), "--serve", str(port), "--out", str(tmp_path / "run")]
+    assert main([*given, *arguments]) == 0
+    assert answers == [(port, True)]
+    assert not listening(port)
 
 
 def test_it_ends_with_a_killed_parent() -> None:
