@@ -23,6 +23,8 @@ from bmask_slam.graph.trajectory_formats import read_trajectory
 logger = logging.getLogger(__name__)
 
 TRUTH, TRUTH_BODY = "groundtruth.txt", "groundtruth.yaml"
+MARKERS = "groundtruth_markers.txt"
+"""What a Bonn sequence's truth is kept as where its groundtruth.txt is converted already."""
 MAX_SKEWNESS = 1e-3
 """Of a rotation in a groundtruth.yaml, whose digits are rounded."""
 _CURE = "write T_body_camera: [16 numbers, row by row]"
@@ -77,7 +79,8 @@ def find_truth_body(folder: Path) -> TruthBody | None:
     file = folder / TRUTH_BODY
     if file.is_file():
         return _read_truth_body(file)
-    return BONN if _BONN_FOLDER.fullmatch(folder.resolve().name.lower()) else None
+    published = _BONN_FOLDER.fullmatch(folder.resolve().name.lower())
+    return BONN if published and not (folder / MARKERS).is_file() else None
 
 
 def _read_truth_body(file: Path) -> TruthBody:

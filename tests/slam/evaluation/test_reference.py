@@ -12,7 +12,7 @@ from small_layouts import POSES, SMALL_LAYOUTS, write_small
 
 from bmask_slam.calibration import calibrate
 from bmask_slam.evaluation import evaluate, read_reference
-from bmask_slam.evaluation.reference import BONN, TRUTH, TRUTH_BODY, TruthBody
+from bmask_slam.evaluation.reference import BONN, MARKERS, TRUTH, TRUTH_BODY, TruthBody
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
@@ -79,6 +79,14 @@ def test_a_folder_of_bonn_is_known_by_its_name(tmp_path: Path, caplog, monkeypat
     monkeypatch.setattr(calibrate, "MIN_REFERENCE_POSES", 3)
     positions, _ = calibrate._reference_positions(folder, sequence.timestamps_s, np.array(POSES))
     assert np.allclose(positions, np.array(POSES)[:, :3, 3], atol=1e-5)
+
+
+def test_a_folder_of_bonn_that_keeps_its_markers_is_converted_already(tmp_path: Path) -> None:
+    folder = write_body(tmp_path, "rgbd_bonn_crowd2", TruthBody())
+    (folder / MARKERS).write_text("# as published\n")
+    check(read_reference(folder))
+    (folder / MARKERS).unlink()
+    assert not np.allclose(read_reference(folder).poses_world_camera, POSES, atol=0.1)
 
 
 def test_other_names_are_of_the_camera(tmp_path: Path) -> None:
