@@ -24,7 +24,7 @@ from engine import NUMBERS, TOKENS, Make, Reader
 from fake_run import CAMERA as SMALL_CAMERA
 from fake_run import FakeSystem, make_sequence
 from recorded_bags import write_bag
-from ros2_player import example_message
+from ros2_messages import example_message
 from safetensors.torch import save
 from small_comparison import make_comparison
 from small_layouts import SMALL_LAYOUTS, SmallLayout, write_small

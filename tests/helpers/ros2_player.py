@@ -15,28 +15,19 @@ import select
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from ros2_messages import HEARD, told
 from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.graph.geometry import inverse, make_pose, rotation_from_quaternion, se3_exp
-from bmask_slam.live.ros2.dds import DdsNode, idl_struct
+from bmask_slam.live.ros2.dds import DdsNode
 from bmask_slam.live.ros2.messages import header, message, transform, type_name
 from bmask_slam.live.ros2.messages import pose as ros_pose
-from bmask_slam.live.ros2.transport import LATCHED, SENSOR, STATE, typestore
+from bmask_slam.live.ros2.transport import LATCHED, SENSOR, typestore
 
 COLOUR, DEPTH = "/camera/camera/color/image_raw", "/camera/camera/aligned_depth_to_color/image_raw"
 INFO, WHEELS = "/camera/camera/color/camera_info", "/odom"
-HEARD = {
-    "/bmask_slam/odometry": ("Odometry", STATE),
-    "/bmask_slam/pose": ("PoseWithCovarianceStamped", STATE),
-    "/bmask_slam/path": ("Path", LATCHED),
-    "/bmask_slam/landmarks": ("PointCloud2", LATCHED),
-    "/diagnostics": ("DiagnosticArray", STATE),
-    "/tf": ("TFMessage", STATE),
-    "/tf_static": ("TFMessage", LATCHED),
-}
 T_BASE_CAMERA = make_pose(
     rotation_from_quaternion(np.array([0.4, -0.5, 0.6, -0.5])), np.array([0.3, 0.1, 0.9])
 )
@@ -88,31 +79,6 @@ def info(stamp_s: float) -> object:
         header(stamp_s, "camera"), CAMERA.height, CAMERA.width, "plumb_bob", np.zeros(5),
         CAMERA.K.ravel(), np.eye(3).ravel(), p, 0, 0, roi,
     )  # fmt: skip
-
-
-def example_message(name: str, rng: np.random.Generator, as_idl: bool = False) -> Any:
-    """A message with random values: of rosbags, or of the struct that cyclonedds knows."""
-    store = typestore()
-    values = {f: _value(kind, rng, as_idl) for f, kind in store.fielddefs[name][1]}
-    return (idl_struct(name) if as_idl else store.types[name])(**values)
-
-
-def _value(kind: Any, rng: np.random.Generator, as_idl: bool) -> Any:
-    node, described = kind[0].name, kind[1]
-    if node == "NAME":
-        return example_message(described, rng, as_idl)
-    if node == "BASE":
-        base = described[0]
-        if base == "string":
-            return "abcdefgh"[: int(rng.integers(0, 8))]
-        if base == "bool":
-            return bool(rng.integers(0, 2))
-        return float(np.float32(rng.normal())) if "float" in base else int(rng.integers(0, 100))
-    count = described[1] if node == "ARRAY" else int(rng.integers(1, 4))
-    values = [_value(described[0], rng, as_idl) for _ in range(count)]
-    if as_idl or described[0][0].name == "NAME" or described[0][1][0] == "string":
-        return values
-    return np.array(values, described[0][1][0])
 
 
 class Caller:
@@ -201,32 +167,6 @@ def main() -> None:
         quiet_s = time.monotonic() if hear() else quiet_s
         time.sleep(0.02)
     Path(out).write_text(json.dumps(heard | {"answers": caller.answers}))
-
-
-def told(received: object) -> dict:
-    """What the test asks of a message."""
-    name = type(received).__name__.rpartition("__")[2]
-    if name == "Odometry":
-        p, q = received.pose.pose.position, received.pose.pose.orientation
-        stamp = received.header.stamp
-        return {
-            "stamp_s": stamp.sec + 1e-9 * stamp.nanosec, "position": [p.x, p.y, p.z],
-            "quaternion": [q.x, q.y, q.z, q.w], "frame": received.header.frame_id,
-            "child": received.child_frame_id,
-        }  # fmt: skip
-    if name == "TFMessage":
-        moved = [t.transform.translation for t in received.transforms]
-        return {
-            "links": [[t.header.frame_id, t.child_frame_id] for t in received.transforms],
-            "moved": [[v.x, v.y, v.z] for v in moved],
-        }
-    if name == "PointCloud2":
-        return {"points": received.width, "fields": [f.name for f in received.fields]}
-    if name == "DiagnosticArray":
-        return {"status": received.status[0].message}
-    if name == "Path":
-        return {"poses": len(received.poses)}
-    return {"name": name}
 
 
 if __name__ == "__main__":

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -14,7 +11,9 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 
-from ros2_player import BEGIN_S, T_BASE_CAMERA, T_ODOM_MAP, example_message, info, pose
+from ros2_messages import example_message
+from ros2_player import BEGIN_S, T_BASE_CAMERA, T_ODOM_MAP, info, pose
+from ros2_processes import LOOPBACK, begin_process
 
 from bmask_slam.cli import main
 from bmask_slam.config.configuration import resolve
@@ -43,10 +42,6 @@ TYPES = (
     "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PointStamped",
 )  # fmt: skip
-LOOPBACK = """<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterface name="lo"
-multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast></General><Discovery>
-<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>20</MaxAutoParticipantIndex>
-<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 DOMAIN, FRAMES = 77, 10
 
 
@@ -119,11 +114,7 @@ def test_images_are_taken_of_best_effort_as_ros_sends_them(sent: Quality, monkey
 
 def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
-    helpers = Path(__file__).parents[3] / "helpers"
-    path = os.pathsep.join([str(helpers), *filter(None, sys.path)])
-    words = [sys.executable, helpers / "ros2_player.py", DOMAIN, 10, tmp_path / "heard"]
-    env = {**os.environ, "PYTHONPATH": path}
-    with subprocess.Popen(list(map(str, words)), env=env, stdin=subprocess.PIPE) as player:
+    with begin_process("ros2_player", DOMAIN, 10, tmp_path / "heard") as player:
         out = tmp_path / "run"
         options = (
             "--segmenter",
@@ -151,6 +142,10 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
         found = make_pose(R, np.array(one["position"]))
         expected = T_BASE_CAMERA @ inverse(pose(0)) @ pose(k) @ inverse(T_BASE_CAMERA)
         assert np.allclose(found, expected, atol=0.003)
+    for topic in ("/bmask_slam/odometry", "/bmask_slam/pose"):
+        received = np.array([one["covariance"] for one in heard[topic][1:]]).reshape(-1, 6, 6)
+        sigmas = np.sqrt(np.linalg.eigvalsh(received))  # the first begins the map and has none
+        assert np.all((sigmas > 1e-6) & (sigmas < 0.03))  # rad, m
     links = {tuple(link) for tf in heard["/tf"] + heard["/tf_static"] for link in tf["links"]}
     assert links == {("map", "odom"), ("base_link", "camera")}  # the second is the player's
     assert np.allclose(heard["/tf"][-1]["moved"], inverse(T_ODOM_MAP)[:3, 3], atol=0.003)

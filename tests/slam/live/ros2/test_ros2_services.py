@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +12,7 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 
-from test_ros2 import LOOPBACK
+from ros2_processes import LOOPBACK, begin_process
 from test_ros2_maps import T_MAP_WORLD, Run, room, some_objects
 from test_ros2_sensors import StandIn
 
@@ -197,12 +194,8 @@ def test_a_call_has_its_number_before_its_fields() -> None:
 
 def test_a_second_process_calls_each_service(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
-    helpers = Path(__file__).parents[3] / "helpers"
-    path = os.pathsep.join([str(helpers), *filter(None, sys.path)])
     calls = ["localise_only=on", "save_map", "localise_only=off", "reset"]
-    words = [sys.executable, helpers / "ros2_player.py", DOMAIN, 20, tmp_path / "heard", *calls]
-    env = {**os.environ, "PYTHONPATH": path}
-    with subprocess.Popen(list(map(str, words)), env=env, stdin=subprocess.PIPE) as player:
+    with begin_process("ros2_player", DOMAIN, 20, tmp_path / "heard", *calls) as player:
         out = tmp_path / "run"
         options = ("--segmenter", "none", "--calibrate", "off", "--quiet", "--silence", "60")
         options += ("--reliable",)  # on a full machine of best effort hardly an image is whole
