@@ -1,17 +1,20 @@
 """A second process on a DDS domain: plays a moving camera before a plane, and keeps what it hears.
 
-Arguments: domain, rate in Hz, file for the received messages (JSON), and services to call, each
-after the answer of the one before. Frames that are dropped do not matter: the camera goes to and
+Services are called one after the other, each after the answer of the one before. Frames that are dropped do not matter: the camera goes to and
 fro until standard input is closed, a step for each odometry that is heard, or every PATIENCE ticks.
 
 Until the first is heard, few colour images have a depth image of their time. Frames that wait
-while a live run starts would be more than it has time for, and it would drop them.
+while a live run starts would be more than it has time for, and it would drop them. A camera that is
+started again (--first) plays to a run that has started.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
+import os
 import select
+import signal
 import sys
 import time
 from pathlib import Path
@@ -112,10 +115,22 @@ class Caller:
             self._waits = True
 
 
+def parsed(words: list[str]) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("domain", type=int)
+    parser.add_argument("rate_hz", type=float)
+    parser.add_argument("out", type=Path, help="file for the received messages, JSON by topic")
+    parser.add_argument("calls", nargs="*", help="services to call, such as save_map")
+    parser.add_argument("--first", type=int, default=0, help="the first frame, without waiting")
+    parser.add_argument("--die-after", type=int, default=0, help="odometry messages until SIGKILL")
+    return parser.parse_args(words)
+
+
 def main() -> None:
     """Play frames until standard input is closed."""
-    domain, rate_hz, out = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
-    node = DdsNode(domain)
+    options = parsed(sys.argv[1:])
+    node = DdsNode(options.domain)
     image_type = "sensor_msgs/msg/Image"
     colours = node.writer(COLOUR, image_type, SENSOR._replace(reliable=True))
     depths = node.writer(DEPTH, image_type, SENSOR._replace(reliable=True))
@@ -127,7 +142,7 @@ def main() -> None:
     readers = {t: node.reader(t, type_name(k), q) for t, (k, q) in HEARD.items()}
     heard: dict[str, list] = {topic: [] for topic in HEARD}
     rendered = [render_plane(pose(k), k) for k in range(PLACES)]
-    caller = Caller(node, sys.argv[4:])
+    caller = Caller(node, options.calls)
 
     def hear() -> bool:
         """Take what has come; whether anything has."""
@@ -146,27 +161,30 @@ def main() -> None:
         if depth:
             depths.send(image(stamp_s, "32FC1", frame.depth_m.astype(np.float32)))
 
-    k, idle, known, end_s = -WAITING, 0, 0, time.monotonic() + LONGEST_S
+    k = options.first or -WAITING
+    idle, known, end_s = 0, 0, time.monotonic() + LONGEST_S
     while not select.select([sys.stdin], [], [], 0)[0] and time.monotonic() < end_s:
         hear()
         poses = heard["/bmask_slam/odometry"]
+        if options.die_after and len(poses) >= options.die_after:
+            os.kill(os.getpid(), signal.SIGKILL)
         waits = not node.published().keys() >= HEARD.keys()  # what is tracked would go unheard
         if not waits and (len(poses) > known or idle >= PATIENCE):
             k = max(k, 0) if poses else k
             play(k)
             k, idle, known = k + 1, 0, len(poses)
-        elif not poses:
+        elif not poses and not options.first:
             play(k, rgb=k % 2 == 0, depth=k % 2 == 1)
             k += 1
         if poses:
             caller.step(k)
         idle += 1
-        time.sleep(1 / rate_hz)
+        time.sleep(1 / options.rate_hz)
     quiet_s = time.monotonic()
     while time.monotonic() < quiet_s + QUIET_S:
         quiet_s = time.monotonic() if hear() else quiet_s
         time.sleep(0.02)
-    Path(out).write_text(json.dumps(heard | {"answers": caller.answers}))
+    options.out.write_text(json.dumps(heard | {"answers": caller.answers}))
 
 
 if __name__ == "__main__":

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import signal
+import threading
 import time
 from pathlib import Path
 
@@ -41,13 +43,15 @@ TYPES = (
     "diagnostic_msgs/msg/DiagnosticArray", "vision_msgs/msg/Detection3DArray",
     "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PointStamped",
+    *(f"std_srvs/srv/{name}_{way}" for name in ("Trigger", "SetBool")
+      for way in ("Request", "Response")),
 )  # fmt: skip
 DOMAIN, FRAMES = 77, 10
 
 
 @pytest.mark.parametrize("name", TYPES)
 def test_bytes_are_those_of_rosbags(name: str) -> None:
-    for seed in range(3):
+    for seed in range(6):
         ours = example_message(name, np.random.default_rng(seed), True)
         theirs = example_message(name, np.random.default_rng(seed))
         expected = bytes(typestore().serialize_cdr(theirs, name))
@@ -112,6 +116,16 @@ def test_images_are_taken_of_best_effort_as_ros_sends_them(sent: Quality, monkey
     assert heard[0].header.stamp.sec == 12
 
 
+def check_poses(odometry: list[dict]) -> None:
+    """Received poses of the base are those of the player's frames."""
+    for one in odometry:
+        k = round(30 * (one["stamp_s"] - BEGIN_S))
+        R = rotation_from_quaternion(np.array(one["quaternion"]))
+        found = make_pose(R, np.array(one["position"]))
+        expected = T_BASE_CAMERA @ inverse(pose(0)) @ pose(k) @ inverse(T_BASE_CAMERA)
+        assert np.allclose(found, expected, atol=0.003)
+
+
 def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
     with begin_process("ros2_player", DOMAIN, 10, tmp_path / "heard") as player:
@@ -136,12 +150,7 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
     odometry = heard["/bmask_slam/odometry"]
     assert len(odometry) >= FRAMES - 4  # of best effort
     assert {(o["frame"], o["child"]) for o in odometry} == {("map", "base_link")}
-    for one in odometry:
-        k = round(30 * (one["stamp_s"] - BEGIN_S))
-        R = rotation_from_quaternion(np.array(one["quaternion"]))
-        found = make_pose(R, np.array(one["position"]))
-        expected = T_BASE_CAMERA @ inverse(pose(0)) @ pose(k) @ inverse(T_BASE_CAMERA)
-        assert np.allclose(found, expected, atol=0.003)
+    check_poses(odometry)
     for topic in ("/bmask_slam/odometry", "/bmask_slam/pose"):
         received = np.array([one["covariance"] for one in heard[topic][1:]]).reshape(-1, 6, 6)
         sigmas = np.sqrt(np.linalg.eigvalsh(received))  # the first begins the map and has none
@@ -158,3 +167,33 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
     assert len(heard["/bmask_slam/pose"]) == len(odometry)
     mounting = resolve(SystemConfig, out / "config.yaml").sensors.odometry.camera_in_base
     assert np.allclose(T_of(mounting), T_BASE_CAMERA)
+
+
+def test_a_player_is_killed_and_started_again(tmp_path: Path, monkeypatch) -> None:
+    """The second one's first frame is where the first one began, 3 s later."""
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    again, out, players, ended = 90, tmp_path / "run", [], threading.Event()
+
+    def play() -> None:
+        for name, *words in (("killed", "--die-after", 3), ("again", "--first", again)):
+            if not ended.is_set():
+                words = [DOMAIN + 4, 10, tmp_path / name, *words]
+                players.append(begin_process("ros2_player", *words))
+                players[-1].wait(600)
+
+    playing = threading.Thread(target=play)
+    playing.start()
+    options = ("--segmenter", "none", "--calibrate", "off", "--quiet", "--silence", "300")
+    code = main(["live", f"ros2:{DOMAIN + 4}", "--out", str(out), "--max-frames", str(2 * FRAMES),
+                 "--odometry-topic", "/odom", "--reliable", *options])  # fmt: skip
+    ended.set()
+    players[-1].communicate(timeout=60)
+    playing.join(60)
+    assert code == 0
+    assert [player.returncode for player in players] == [-signal.SIGKILL, 0]
+    odometry = json.loads((tmp_path / "again").read_text())["/bmask_slam/odometry"]
+    assert len(odometry) >= 3
+    assert all(one["stamp_s"] >= BEGIN_S + again / 30 for one in odometry)
+    check_poses(odometry)
+    saved = np.loadtxt(out / "trajectory.txt", ndmin=2)[:, 0]
+    assert saved.min() < BEGIN_S + 1 < BEGIN_S + again / 30 <= saved.max()
