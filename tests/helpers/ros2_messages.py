@@ -43,9 +43,9 @@ def _value(kind: Any, rng: np.random.Generator, as_idl: bool) -> Any:
             return "abcdefgh"[: int(rng.integers(0, 8))]
         if base == "bool":
             return bool(rng.integers(0, 2))
-        if "float" in base:
-            return float(np.float32(rng.normal()))
-        return int(rng.integers(-100 if base.startswith("int") else 0, 100))
+        lowest = -100 if base.startswith("int") else 0
+        is_real = "float" in base
+        return float(np.float32(rng.normal())) if is_real else int(rng.integers(lowest, 100))
     count = described[1] if node == "ARRAY" else int(rng.integers(0, 4))
     values = [_value(described[0], rng, as_idl) for _ in range(count)]
     if as_idl or described[0][0].name == "NAME" or described[0][1][0] == "string":

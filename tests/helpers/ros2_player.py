@@ -1,7 +1,8 @@
 """A second process on a DDS domain: plays a moving camera before a plane, and keeps what it hears.
 
-Services are called one after the other, each after the answer of the one before. Frames that are dropped do not matter: the camera goes to and
-fro until standard input is closed, a step for each odometry that is heard, or every PATIENCE ticks.
+Services are called one after the other, each after the answer of the one before. Frames that are
+dropped do not matter: the camera goes to and fro until standard input is closed, a step for each
+odometry that is heard, or every PATIENCE ticks.
 
 Until the first is heard, few colour images have a depth image of their time. Frames that wait
 while a live run starts would be more than it has time for, and it would drop them. A camera that is
@@ -19,6 +20,7 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 from ros2_messages import HEARD, told
 from synthetic_view import CAMERA, render_plane
@@ -71,6 +73,23 @@ def image(stamp_s: float, encoding: str, pixels: np.ndarray) -> object:
     data = np.frombuffer(np.ascontiguousarray(pixels).tobytes(), np.uint8)
     step = len(data) // height
     return kind(header(stamp_s, "camera"), height, width, encoding, 0, step, data)
+
+
+def compressed_colour(stamp_s: float, rgb: np.ndarray) -> object:
+    """A sensor_msgs/CompressedImage as image_transport makes it."""
+    return _compressed(stamp_s, "rgb8; jpeg compressed bgr8", ".jpg", rgb[..., ::-1], b"")
+
+
+def compressed_depth(stamp_s: float, depth_m: np.ndarray) -> object:
+    """The same of depth, in millimetres, with the twelve bytes of a header that it puts first."""
+    stored = np.nan_to_num(np.round(1e3 * depth_m)).astype(np.uint16)
+    return _compressed(stamp_s, "16UC1; compressedDepth png", ".png", stored, bytes(12))
+
+
+def _compressed(stamp_s: float, form: str, suffix: str, pixels: np.ndarray, head: bytes) -> object:
+    encoded = cv2.imencode(suffix, np.ascontiguousarray(pixels))[1].tobytes()
+    data = np.frombuffer(head + encoded, np.uint8)
+    return message("CompressedImage", header(stamp_s, "camera"), form, data)
 
 
 def info(stamp_s: float) -> object:
@@ -127,22 +146,47 @@ def parsed(words: list[str]) -> argparse.Namespace:
     return parser.parse_args(words)
 
 
+class Player:
+    """A camera and wheels that publish.
+
+    Attributes:
+        rendered: the camera's frames, by place.
+    """
+
+    def __init__(self, node: DdsNode, compressed: bool = False) -> None:
+        quality = SENSOR._replace(reliable=True)
+        kind = type_name("CompressedImage" if compressed else "Image")
+        forms = ("/compressed", "/compressedDepth") if compressed else ("", "")
+        self._colours = node.writer(f"{COLOUR}{forms[0]}", kind, quality)
+        self._depths = node.writer(f"{DEPTH}{forms[1]}", kind, quality)
+        self._infos = node.writer(INFO, "sensor_msgs/msg/CameraInfo", quality)
+        self._odometry = node.writer(WHEELS, type_name("Odometry"), quality)
+        self._static = node.writer("/tf_static", type_name("TFMessage"), LATCHED)
+        link = transform(0.0, ("base_link", "camera"), T_BASE_CAMERA)
+        self._static.send(message("TFMessage", [link]))
+        self._compressed = compressed
+        self.rendered = [render_plane(pose(k), k) for k in range(PLACES)]
+
+    def play(self, k: int, rgb: bool = True, depth: bool = True) -> None:
+        """Send a frame, or one of its images, and where the wheels are."""
+        stamp_s, frame = BEGIN_S + k / 30, self.rendered[place(k)]
+        self._infos.send(info(stamp_s))
+        self._odometry.send(wheels(k))
+        if rgb:
+            raw = image(stamp_s, "rgb8", frame.rgb)
+            self._colours.send(compressed_colour(stamp_s, frame.rgb) if self._compressed else raw)
+        if depth:
+            raw = image(stamp_s, "32FC1", frame.depth_m.astype(np.float32))
+            self._depths.send(compressed_depth(stamp_s, frame.depth_m) if self._compressed else raw)
+
+
 def main() -> None:
     """Play frames until standard input is closed."""
     options = parsed(sys.argv[1:])
     node = DdsNode(options.domain)
-    image_type = "sensor_msgs/msg/Image"
-    colours = node.writer(COLOUR, image_type, SENSOR._replace(reliable=True))
-    depths = node.writer(DEPTH, image_type, SENSOR._replace(reliable=True))
-    infos = node.writer(INFO, "sensor_msgs/msg/CameraInfo", SENSOR._replace(reliable=True))
-    odometry = node.writer(WHEELS, type_name("Odometry"), SENSOR._replace(reliable=True))
-    static = node.writer("/tf_static", type_name("TFMessage"), LATCHED)
-    link = transform(0.0, ("base_link", "camera"), T_BASE_CAMERA)
-    static.send(message("TFMessage", [link]))
+    player, caller = Player(node), Caller(node, options.calls)
     readers = {t: node.reader(t, type_name(k), q) for t, (k, q) in HEARD.items()}
     heard: dict[str, list] = {topic: [] for topic in HEARD}
-    rendered = [render_plane(pose(k), k) for k in range(PLACES)]
-    caller = Caller(node, options.calls)
 
     def hear() -> bool:
         """Take what has come; whether anything has."""
@@ -150,16 +194,6 @@ def main() -> None:
         for topic, messages in found.items():
             heard[topic] += messages
         return any(found.values())
-
-    def play(k: int, rgb: bool = True, depth: bool = True) -> None:
-        """Send a frame, or one of its images."""
-        stamp_s, frame = BEGIN_S + k / 30, rendered[place(k)]
-        infos.send(info(stamp_s))
-        odometry.send(wheels(k))
-        if rgb:
-            colours.send(image(stamp_s, "rgb8", frame.rgb))
-        if depth:
-            depths.send(image(stamp_s, "32FC1", frame.depth_m.astype(np.float32)))
 
     k = options.first or -WAITING
     idle, known, end_s = 0, 0, time.monotonic() + LONGEST_S
@@ -171,10 +205,10 @@ def main() -> None:
         waits = not node.published().keys() >= HEARD.keys()  # what is tracked would go unheard
         if not waits and (len(poses) > known or idle >= PATIENCE):
             k = max(k, 0) if poses else k
-            play(k)
+            player.play(k)
             k, idle, known = k + 1, 0, len(poses)
         elif not poses and not options.first:
-            play(k, rgb=k % 2 == 0, depth=k % 2 == 1)
+            player.play(k, rgb=k % 2 == 0, depth=k % 2 == 1)
             k += 1
         if poses:
             caller.step(k)

@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("cyclonedds")
 
 from ros2_messages import example_message
-from ros2_player import BEGIN_S, T_BASE_CAMERA, T_ODOM_MAP, info, pose
+from ros2_player import BEGIN_S, T_BASE_CAMERA, T_ODOM_MAP, Player, info, place, pose
 from ros2_processes import LOOPBACK, begin_process
 
 from bmask_slam.cli import main
@@ -116,6 +116,32 @@ def test_images_are_taken_of_best_effort_as_ros_sends_them(sent: Quality, monkey
     assert heard[0].header.stamp.sec == 12
 
 
+def test_compressed_images_become_frames(monkeypatch) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    player, ended = Player(DdsNode(DOMAIN + 5), compressed=True), threading.Event()
+
+    def play() -> None:
+        k = 0
+        while not ended.wait(0.1):
+            player.play(k)
+            k += 1
+
+    playing = threading.Thread(target=play)
+    playing.start()
+    try:
+        options = SourceOptions(silence_s=60, reliable=True)
+        source = open_source(f"ros2:{DOMAIN + 5}", options)
+        frame = next(source.frames())
+    finally:
+        ended.set()
+        playing.join(10)
+    sent = player.rendered[place(round(30 * (frame.timestamp_s - BEGIN_S)))]
+    off = np.abs(frame.rgb.astype(int) - sent.rgb)
+    assert 0 < off.mean() < 3  # of JPEG
+    assert np.nanmax(np.abs(frame.depth_m - sent.depth_m)) < 0.00051
+    assert np.array_equal(np.isnan(frame.depth_m), np.isnan(sent.depth_m))
+
+
 def check_poses(odometry: list[dict]) -> None:
     """Received poses of the base are those of the player's frames."""
     for one in odometry:
@@ -177,8 +203,8 @@ def test_a_player_is_killed_and_started_again(tmp_path: Path, monkeypatch) -> No
     def play() -> None:
         for name, *words in (("killed", "--die-after", 3), ("again", "--first", again)):
             if not ended.is_set():
-                words = [DOMAIN + 4, 10, tmp_path / name, *words]
-                players.append(begin_process("ros2_player", *words))
+                given = DOMAIN + 4, 10, tmp_path / name, *words
+                players.append(begin_process("ros2_player", *given))
                 players[-1].wait(600)
 
     playing = threading.Thread(target=play)
