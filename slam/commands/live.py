@@ -177,9 +177,9 @@ def _live_on(arguments: argparse.Namespace, source: Source) -> int:
 
     config = chosen_config(arguments).config
     options, ros2 = _live_options(arguments, source), ros2_of(source)
+    listener, services = None, None
     if ros2 is not None:
-        config = replace(config, sensors=ros2.mounted(config.sensors))
-    listener, services = (None, None) if ros2 is None else ros2_ends(ros2, arguments.ros2_params)
+        config, listener, services = ros2_ends(ros2, arguments.ros2_params, config)
     before: Path | None = None
     while True:
         with LiveSlam(source.camera, config, options) as slam:

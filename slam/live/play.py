@@ -22,6 +22,7 @@ from bmask_slam.runtime.progress import make_bar
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.sequences.prefetch import FEATURES_AHEAD, prefetched
+from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
 
 logger = logging.getLogger(__name__)
@@ -142,23 +143,26 @@ def _newest(
         newest.stop(STOP_S if stop.signal is None else 0.0)
 
 
-def ros2_ends(source: Ros2Source, params: Path | None) -> tuple[Ros2Publisher, Ros2Services]:
-    """What publishes the results to ROS 2, and what serves its calls.
+def ros2_ends(
+    source: Ros2Source, params: Path | None, config: SystemConfig
+) -> tuple[SystemConfig, Ros2Publisher, Ros2Services]:
+    """The settings with the sensors' mountings, what publishes the results, what serves calls.
 
     Args:
         params: file with `Ros2Frames`, as YAML.
     """
     frames = resolve(Ros2Frames, params)
+    config = replace(config, sensors=source.mounted(config.sensors, frames))
     T, by_tf = frames.T_base_camera, False
     if T is None:
         T = source.T_base_camera(frames.base)
         by_tf = T is not None
-    wheels = "odometry" in source.sensors.names
     robot = Robot(
         OPTICAL if T is None else T,
         T is not None,
         by_tf,
-        source.sensors.T_odom_base if wheels else None,
+        source.sensors.T_odom_base if source.sensors.has_odometry else None,
         source.ros_time,
     )
-    return Ros2Publisher(source.node, frames, robot), Ros2Services(source.node, frames.prefix)
+    services = Ros2Services(source.node, frames.prefix)
+    return config, Ros2Publisher(source.node, frames, robot), services

@@ -29,7 +29,7 @@ from bmask_slam.graph.geometry import inverse, make_pose, rotation_from_quaterni
 from bmask_slam.live.ros2.dds import DdsNode
 from bmask_slam.live.ros2.messages import header, message, transform, type_name
 from bmask_slam.live.ros2.messages import pose as ros_pose
-from bmask_slam.live.ros2.transport import LATCHED, SENSOR, typestore
+from bmask_slam.live.ros2.transport import LATCHED, SENSOR, STATE, typestore
 
 COLOUR, DEPTH = "/camera/camera/color/image_raw", "/camera/camera/aligned_depth_to_color/image_raw"
 INFO, WHEELS = "/camera/camera/color/camera_info", "/odom"
@@ -56,13 +56,17 @@ def pose(k: int) -> np.ndarray:
     return se3_exp(place(k) * np.array([0, 0.01, 0, 0.02, 0, 0]))
 
 
-def wheels(k: int) -> object:
-    """A nav_msgs/Odometry of a frame's time, in a frame of its own."""
+def T_odom_base(k: int) -> np.ndarray:
+    """Where the wheels say the base is, at a frame's time, in a frame of their own."""
     T = inverse(pose(0)) @ pose(k)
-    T_odom_base = T_ODOM_MAP @ T_BASE_CAMERA @ T @ inverse(T_BASE_CAMERA)
+    return T_ODOM_MAP @ T_BASE_CAMERA @ T @ inverse(T_BASE_CAMERA)
+
+
+def wheels(k: int) -> object:
+    """The same as nav_msgs/Odometry."""
     zero = message("Vector3", 0.0, 0.0, 0.0)
     twist = message("TwistWithCovariance", message("Twist", zero, zero), np.zeros(36))
-    known = message("PoseWithCovariance", ros_pose(T_odom_base), np.zeros(36))
+    known = message("PoseWithCovariance", ros_pose(T_odom_base(k)), np.zeros(36))
     return message("Odometry", header(BEGIN_S + k / 30, "odom"), "base_link", known, twist)
 
 
@@ -143,24 +147,27 @@ def parsed(words: list[str]) -> argparse.Namespace:
     parser.add_argument("calls", nargs="*", help="services to call, such as save_map")
     parser.add_argument("--first", type=int, default=0, help="the first frame, without waiting")
     parser.add_argument("--die-after", type=int, default=0, help="odometry messages until SIGKILL")
+    parser.add_argument("--tf", action="store_true", help="wheels by /tf in place of a topic")
     return parser.parse_args(words)
 
 
 class Player:
-    """A camera and wheels that publish.
+    """A camera and wheels that publish; with ``by_tf`` the wheels by /tf alone.
 
     Attributes:
         rendered: the camera's frames, by place.
     """
 
-    def __init__(self, node: DdsNode, compressed: bool = False) -> None:
+    def __init__(self, node: DdsNode, compressed: bool = False, by_tf: bool = False) -> None:
         quality = SENSOR._replace(reliable=True)
         kind = type_name("CompressedImage" if compressed else "Image")
         forms = ("/compressed", "/compressedDepth") if compressed else ("", "")
         self._colours = node.writer(f"{COLOUR}{forms[0]}", kind, quality)
         self._depths = node.writer(f"{DEPTH}{forms[1]}", kind, quality)
         self._infos = node.writer(INFO, "sensor_msgs/msg/CameraInfo", quality)
-        self._odometry = node.writer(WHEELS, type_name("Odometry"), quality)
+        self._by_tf = by_tf
+        wheels_topic = ("/tf", "TFMessage", STATE) if by_tf else (WHEELS, "Odometry", quality)
+        self._odometry = node.writer(wheels_topic[0], type_name(wheels_topic[1]), wheels_topic[2])
         self._static = node.writer("/tf_static", type_name("TFMessage"), LATCHED)
         link = transform(0.0, ("base_link", "camera"), T_BASE_CAMERA)
         self._static.send(message("TFMessage", [link]))
@@ -171,7 +178,8 @@ class Player:
         """Send a frame, or one of its images, and where the wheels are."""
         stamp_s, frame = BEGIN_S + k / 30, self.rendered[place(k)]
         self._infos.send(info(stamp_s))
-        self._odometry.send(wheels(k))
+        link = transform(stamp_s, ("odom", "base_link"), T_odom_base(k))
+        self._odometry.send(message("TFMessage", [link]) if self._by_tf else wheels(k))
         if rgb:
             raw = image(stamp_s, "rgb8", frame.rgb)
             self._colours.send(compressed_colour(stamp_s, frame.rgb) if self._compressed else raw)
@@ -184,7 +192,7 @@ def main() -> None:
     """Play frames until standard input is closed."""
     options = parsed(sys.argv[1:])
     node = DdsNode(options.domain)
-    player, caller = Player(node), Caller(node, options.calls)
+    player, caller = Player(node, by_tf=options.tf), Caller(node, options.calls)
     readers = {t: node.reader(t, type_name(k), q) for t, (k, q) in HEARD.items()}
     heard: dict[str, list] = {topic: [] for topic in HEARD}
 

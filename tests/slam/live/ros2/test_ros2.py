@@ -14,7 +14,17 @@ import pytest
 pytest.importorskip("cyclonedds")
 
 from ros2_messages import example_message
-from ros2_player import BEGIN_S, T_BASE_CAMERA, T_ODOM_MAP, Player, info, place, pose
+from ros2_player import (
+    BEGIN_S,
+    PLACES,
+    T_BASE_CAMERA,
+    T_ODOM_MAP,
+    Player,
+    T_odom_base,
+    info,
+    place,
+    pose,
+)
 from ros2_processes import LOOPBACK, begin_process
 
 from bmask_slam.cli import main
@@ -193,6 +203,32 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
     assert len(heard["/bmask_slam/pose"]) == len(odometry)
     mounting = resolve(SystemConfig, out / "config.yaml").sensors.odometry.camera_in_base
     assert np.allclose(T_of(mounting), T_BASE_CAMERA)
+
+
+def test_odometry_of_a_second_process_by_tf(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    out, domain = tmp_path / "run", DOMAIN + 6
+    options = ("--segmenter", "none", "--calibrate", "off", "--quiet", "--silence", "60")
+    with begin_process("ros2_player", domain, 10, tmp_path / "heard", "--tf") as player:
+        code = main(["live", f"ros2:{domain}", "--out", str(out), "--max-frames", str(FRAMES - 2),
+                     "--reliable", *options])  # fmt: skip
+        player.communicate(timeout=60)
+        assert (code, player.returncode) == (0, 0)
+    heard = json.loads((tmp_path / "heard").read_text())
+    check_poses(heard["/bmask_slam/odometry"])
+    assert {one["frame"] for one in heard["/bmask_slam/odometry"]} == {"map"}
+    log = (out / "log.txt").read_text()
+    assert log.count("/tf has odom -> base_link, which is not published, and used as odometry") == 1
+    mounting = resolve(SystemConfig, out / "config.yaml").sensors.odometry.camera_in_base
+    assert np.allclose(T_of(mounting), T_BASE_CAMERA)
+    moved = {"odom": [], "base_link": []}  # type: ignore[var-annotated]
+    for one in heard["/tf"]:
+        for (_, child), at in zip(one["links"], one["moved"], strict=True):
+            moved[child].append(at)
+    assert np.allclose(moved["odom"][-1], inverse(T_ODOM_MAP)[:3, 3], atol=0.003)
+    wheels = np.array([T_odom_base(k)[:3, 3] for k in range(PLACES)])
+    off_m = np.linalg.norm(wheels[:, None] - moved["base_link"], axis=2).min(axis=0)
+    assert off_m.max() < 1e-9  # the wheels' own alone
 
 
 def test_a_player_is_killed_and_started_again(tmp_path: Path, monkeypatch) -> None:
