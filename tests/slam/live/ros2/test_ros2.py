@@ -42,6 +42,7 @@ from bmask_slam.live.ros2.dds import DdsNode, carried_type, dds_name, ros_name
 from bmask_slam.live.ros2.messages import ros_covariance
 from bmask_slam.live.ros2.outputs import OPTICAL, Ros2Frames
 from bmask_slam.live.ros2.transport import SENSOR, STATE, Quality, typestore
+from bmask_slam.live.sources import opening
 from bmask_slam.live.sources.opening import SourceOptions, open_source
 from bmask_slam.system_config import SystemConfig
 
@@ -109,6 +110,22 @@ def test_frames_are_checked() -> None:
 def test_other_domains_are_refused(text: str) -> None:
     with pytest.raises(InputError, match="domain"):
         open_source(text, SourceOptions(silence_s=0.1))
+
+
+def test_the_domain_is_that_of_the_environment_or_given(monkeypatch) -> None:
+    def join(domain: int) -> None:
+        raise InputError(f"joined {domain}.")
+
+    monkeypatch.setattr(opening, "DdsNode", join)
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    for variable, text, expected in (
+        ("", "ros2:", "joined 0"), ("42", "ros2:", "joined 42"), ("42", "ros2:7", "joined 7"),
+        ("x", "ros2:", "'x' is no domain"),
+    ):  # fmt: skip
+        if variable:
+            monkeypatch.setenv("ROS_DOMAIN_ID", variable)
+        with pytest.raises(InputError, match=rf"{expected}\b"):
+            open_source(text, SourceOptions())
 
 
 @pytest.mark.parametrize("sent", [SENSOR, STATE], ids=["best effort", "reliable"])
@@ -205,10 +222,13 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
     assert np.allclose(T_of(mounting), T_BASE_CAMERA)
 
 
-def test_odometry_of_a_second_process_by_tf(tmp_path: Path, monkeypatch) -> None:
+def test_odometry_of_a_second_process_by_tf_and_other_frames(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
     out, domain = tmp_path / "run", DOMAIN + 6
-    options = ("--segmenter", "none", "--calibrate", "off", "--quiet", "--silence", "60")
+    params = tmp_path / "params.yaml"
+    params.write_text("map: world\ntf_ahead_s: 0.2\n")
+    options = ("--segmenter", "none", "--calibrate", "off", "--quiet", "--silence", "60",
+               "--ros2-params", str(params))  # fmt: skip
     with begin_process("ros2_player", domain, 10, tmp_path / "heard", "--tf") as player:
         code = main(["live", f"ros2:{domain}", "--out", str(out), "--max-frames", str(FRAMES - 2),
                      "--reliable", *options])  # fmt: skip
@@ -216,15 +236,16 @@ def test_odometry_of_a_second_process_by_tf(tmp_path: Path, monkeypatch) -> None
         assert (code, player.returncode) == (0, 0)
     heard = json.loads((tmp_path / "heard").read_text())
     check_poses(heard["/bmask_slam/odometry"])
-    assert {one["frame"] for one in heard["/bmask_slam/odometry"]} == {"map"}
+    assert {one["frame"] for one in heard["/bmask_slam/odometry"]} == {"world"}
     log = (out / "log.txt").read_text()
     assert log.count("/tf has odom -> base_link, which is not published, and used as odometry") == 1
     mounting = resolve(SystemConfig, out / "config.yaml").sensors.odometry.camera_in_base
     assert np.allclose(T_of(mounting), T_BASE_CAMERA)
     moved = {"odom": [], "base_link": []}  # type: ignore[var-annotated]
     for one in heard["/tf"]:
-        for (_, child), at in zip(one["links"], one["moved"], strict=True):
-            moved[child].append(at)
+        for link, at in zip(one["links"], one["moved"], strict=True):
+            assert link in (["odom", "base_link"], ["world", "odom"])
+            moved[link[1]].append(at)
     assert np.allclose(moved["odom"][-1], inverse(T_ODOM_MAP)[:3, 3], atol=0.003)
     wheels = np.array([T_odom_base(k)[:3, 3] for k in range(PLACES)])
     off_m = np.linalg.norm(wheels[:, None] - moved["base_link"], axis=2).min(axis=0)

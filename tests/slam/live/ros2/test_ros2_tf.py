@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from ros2_player import COLOUR, DEPTH, INFO, T_BASE_CAMERA, image, info
 from synthetic_view import CAMERA
 from test_ros2_sensors import CLOCK, StandIn
 
+from bmask_slam.cli import make_parser
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, make_pose, quaternion_from_rotation, se3_exp
 from bmask_slam.graph.sensors.config import SensorsConfig
@@ -158,3 +160,16 @@ def test_a_mounting_by_tf_must_be_still() -> None:
     show(node, 1000.2)
     with pytest.raises(InputError, match=r"'camera' has moved against 'base_link', by .* 5\.7 deg"):
         next(source.frames())
+
+
+def test_parameters_that_are_unknown_are_refused_by_the_command(tmp_path: Path) -> None:
+    node, _ = robot([tf(0, BASE_CAMERA, T_BASE_CAMERA)], [])
+    node.topics[INFO].append(info(1000.0))
+    show(node, 1000.0)
+    params = tmp_path / "params.yaml"
+    params.write_text("bse: base_link")
+    words = ["live", "ros2:", "--ros2-params", str(params), "--out", str(tmp_path / "run")]
+    arguments = make_parser().parse_args([*words, "--silence", "0.1"])
+    arguments.ros2_node = node
+    with pytest.raises(InputError, match=r"params.yaml.*bse"):
+        arguments.handler(arguments)
