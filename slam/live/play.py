@@ -6,6 +6,7 @@ import logging
 import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, TypeAlias
@@ -141,6 +142,28 @@ def _newest(
             yield pair
     finally:
         newest.stop(STOP_S if stop.signal is None else 0.0)
+
+
+@contextmanager
+def finishing(
+    slam: LiveSlam, publisher: Ros2Publisher | None, services: Ros2Services | None
+) -> Iterator[LiveSlam]:
+    """A run, all of which is published once more when it has ended.
+
+    Also after an InputError, such as a source that has fallen silent, which is raised then.
+    """
+    failure: InputError | None = None
+    with slam:
+        try:
+            yield slam
+        except InputError as error:
+            failure = error
+    if publisher is not None:
+        publisher.finish(slam)
+    if failure is not None:
+        if services is not None:
+            services.end(slam.out)
+        raise failure
 
 
 def ros2_ends(

@@ -20,6 +20,7 @@ from bmask_slam.cli import main
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import make_pose, se3_exp, transform
 from bmask_slam.live.messages import MapSaved
+from bmask_slam.live.play import finishing
 from bmask_slam.live.ros2 import services as services_module
 from bmask_slam.live.ros2.dds import CALL_BYTES, HEADER_BYTES, DdsService, carried_type
 from bmask_slam.live.ros2.grid import LiveCloud
@@ -232,6 +233,31 @@ def test_the_cloud_follows_its_keyframes_and_is_thinned() -> None:
     assert len(found) == 2
     assert colours[:, 2].tolist() == [9, 9]  # the newest
     assert cloud.cloud({6: T}) is None  # the keyframes were culled
+
+
+class Ending(Run):
+    """A run that makes a submap when it is closed, as the last dense map does."""
+
+    out = Path("/nowhere/run")
+
+    def __enter__(self) -> Ending:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.listeners[0](4, room(2.02), np.zeros((len(room(2.02)), 3), np.uint8))
+
+
+def test_everything_is_published_when_the_source_falls_silent() -> None:
+    ros, run = node(), Ending()
+    publish = Ros2Publisher(ros, Ros2Frames(), Robot(T_MAP_WORLD, True))
+    services, call = Ros2Services(ros, "/x"), Call(TRIGGER(0))
+    with pytest.raises(InputError, match="no frame"), finishing(run, publish, services) as slam:
+        publish(FrameResult(0, 5.0, TrackingStatus.OK, np.eye(4)), slam)
+        ros.calls["save_map"] += [call]
+        raise InputError("no frame for 10 s")
+    assert ros.topics["/bmask_slam/cloud"][-1].width > 100
+    assert ros.topics["/bmask_slam/map"][-1].info.width > 20
+    assert call.answers == [(False, ENDED)]
 
 
 def test_another_run_begins_with_an_empty_map() -> None:
