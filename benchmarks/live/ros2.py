@@ -270,6 +270,7 @@ def figures(
     ]
     return {
         "sent": len(sent),
+        "sent_hz": round(float(1 / np.median(np.diff(sent))), 1) if len(sent) > 1 else None,
         "answered": len(mine),
         "late": int(sum(delay > 1 / options.rate for delay in delays)),
         "delay_ms": np.round(1e3 * np.percentile(delays, (50, 95, 100)), 1).tolist()
