@@ -100,7 +100,7 @@ def open_images(path: Path, first: int) -> Iterator[Images]:
     """A recording or a bag from a frame on."""
     if not is_bag(path):
         sequence = open_sequence(path)
-        pairs = (
+        pairs: Iterator[tuple[Any, Any]] = (
             (image(0.0, "rgb8", f.rgb), image(0.0, "32FC1", f.depth_m.astype(np.float32)))
             for f in sequence.frames(first)
         )

@@ -126,21 +126,19 @@ class TfOdometry:
 
     Attributes:
         waiting: messages that are not read yet.
+        broken: transforms of /tf that were none.
     """
 
     def __init__(self, frames: RobotFrames, odom: str, base: str) -> None:
+        self.broken = 0
         self.waiting: deque[Any] = deque(maxlen=KEPT)
         self._frames, self._odom, self._base = frames, odom.lstrip("/"), base.lstrip("/")
         self._last: Any = None
 
-    @property
-    def broken(self) -> int:
-        """Transforms that were none."""
-        return self._frames.broken
-
     def take(self, most: int = 16) -> list[Any]:
         """What was received since the last call, as nav_msgs/Odometry. Raises InputError."""
         self._frames.hear()
+        self.broken = self._frames.broken
         return [self.waiting.popleft() for _ in range(min(most, len(self.waiting)))]
 
     def add(self, one: Any, tree: TransformTree) -> None:

@@ -179,8 +179,9 @@ class Ros2Source(MeasuredSource):
         given = frames.T_base_camera
 
         def T_camera(frame: str) -> Array | None:
-            is_given = given is not None and frame == frames.base
-            return inverse(given) if is_given else self.T_camera(frame)
+            if given is not None and frame.lstrip("/") == frames.base.lstrip("/"):
+                return inverse(given)
+            return self.T_camera(frame)
 
         if not self.sensors.has_odometry:
             self._hear_odometry(config, frames, T_camera)
