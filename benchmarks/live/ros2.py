@@ -1,10 +1,14 @@
 """ROS 2 without ROS: a second process plays a recording over DDS and hears what `live ros2:` says.
 
-    python -m benchmarks.live.ros2 SEQUENCE [--frames 300] [--rate 30] [--kill-after 100] [-- --map]
+    python -m benchmarks.live.ros2 SEQUENCE [--frames 300] [--rate 30] [--kill-after 100]
+        [--make-bag BAG] [-- --map --reliable]
 
-Images are stamped when they are sent, so that the time of an answer less its stamp is the delay of
-the whole way. With --kill-after the player is killed after so many frames and started again two
-seconds later. What stands after -- goes to `bmask-slam live`. All on this machine (loop-back).
+SEQUENCE is a recording or a bag, whose messages are played as they are but for their stamps; with
+--make-bag a recording is written as a bag (mcap) first, and that is played. Images are stamped when
+they are sent, so that the time of an answer less its stamp is the delay of the whole way. Until the
+first answer comes, the first images are sent again and again. With --kill-after the player is
+killed after so many frames and started again two seconds later. What stands after -- goes to
+`bmask-slam live`. All on this machine (loop-back).
 """
 
 from __future__ import annotations
@@ -17,17 +21,26 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from itertools import islice
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice, repeat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.live.ros2.dds import DdsNode
 from bmask_slam.live.ros2.messages import header, type_name
 from bmask_slam.live.ros2.transport import LATCHED, SENSOR, STATE, typestore
+from bmask_slam.live.sources.pairing import Pairer
+from bmask_slam.live.sources.source import SourceCounts
+from bmask_slam.sequences.bags.bag_file import INFO_TYPE, Bag, is_bag, open_bag
 from bmask_slam.sequences.bags.ros_images import stamp_s
+from bmask_slam.sequences.bags.topics import BagTopics, find_topics, first_message
+from bmask_slam.sequences.bags.transforms import TRANSFORMS
 from bmask_slam.sequences.sequence import open_sequence
 
 LOOPBACK = """<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterface name="lo"
@@ -35,12 +48,13 @@ multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast></General>
 <ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>20</MaxAutoParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 COLOUR, DEPTH = "/camera/camera/color/image_raw", "/camera/camera/aligned_depth_to_color/image_raw"
-INFO = "/camera/camera/color/camera_info"
+INFO, IMAGE = "/camera/camera/color/camera_info", type_name("Image")
 HEARD = {
     "/bmask_slam/odometry": ("Odometry", STATE._replace(depth=100)),
     "/bmask_slam/pose": ("PoseWithCovarianceStamped", STATE._replace(depth=100)),
     "/bmask_slam/path": ("Path", LATCHED),
     "/bmask_slam/landmarks": ("PointCloud2", LATCHED),
+    "/bmask_slam/cloud": ("PointCloud2", LATCHED),
     "/bmask_slam/map": ("OccupancyGrid", LATCHED),
     "/bmask_slam/objects": ("Detection3DArray", LATCHED),
     "/bmask_slam/object_markers": ("MarkerArray", LATCHED),
@@ -71,21 +85,86 @@ def camera_info(stamp: float, camera: Camera) -> Any:
     )  # fmt: skip
 
 
-def play(path: Path, first: int, frames: int, rate_hz: float, domain: int) -> None:
+@dataclass(frozen=True)
+class Images:
+    """Pairs of messages to play, their topics and types, and what is sent once, latched."""
+
+    topics: tuple[str, str]
+    types: tuple[str, str]
+    pairs: Iterator[tuple[Any, Any]]
+    once: list[tuple[str, str, Any]]
+
+
+@contextmanager
+def open_images(path: Path, first: int) -> Iterator[Images]:
+    """A recording or a bag from a frame on."""
+    if not is_bag(path):
+        sequence = open_sequence(path)
+        pairs: Iterator[tuple[Any, Any]] = (
+            (image(0.0, "rgb8", f.rgb), image(0.0, "32FC1", f.depth_m.astype(np.float32)))
+            for f in sequence.frames(first)
+        )
+        known = [(INFO, INFO_TYPE, camera_info(0.0, sequence.camera))]
+        yield Images((COLOUR, DEPTH), (IMAGE, IMAGE), pairs, known)
+        return
+    with open_bag(path) as bag:
+        found, kinds = find_topics(bag, BagTopics()), {t.name: t.type for t in bag.topics}
+        names = found.rgb, found.depth
+        known = [(found.camera_info, INFO_TYPE, first_message(bag, found.camera_info))]
+        for topic, still in islice(bag.messages(TRANSFORMS), 1):
+            known.append((topic, kinds[topic], still))
+        pairs = islice(bag_pairs(bag, names), first, None)
+        yield Images(names, (kinds[names[0]], kinds[names[1]]), pairs, known)
+
+
+def bag_pairs(bag: Bag, names: tuple[str, str]) -> Iterator[tuple[Any, Any]]:
+    """Messages of colour and depth that belong together."""
+    pairer = Pairer[Any](SourceCounts())
+    for topic, received in bag.messages(*names):
+        for pair in pairer.add(names.index(topic), stamp_s(received.header), received):
+            yield pair.rgb, pair.depth
+    for pair in pairer.finish():
+        yield pair.rgb, pair.depth
+
+
+def make_bag(path: Path, frames: int, folder: Path) -> None:
+    """Write a recording as a ROS 2 bag (mcap), with the topics of RealSense and depth in mm."""
+    sequence, store = open_sequence(path), typestore()
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        to = {
+            topic: bag.add_connection(topic, kind, typestore=store)
+            for topic, kind in ((COLOUR, IMAGE), (DEPTH, IMAGE), (INFO, INFO_TYPE))
+        }
+        for frame in islice(sequence.frames(), frames):
+            at_s = frame.timestamp_s
+            depth_mm = np.nan_to_num(np.round(1e3 * frame.depth_m)).astype(np.uint16)
+            made = {COLOUR: image(at_s, "rgb8", frame.rgb), DEPTH: image(at_s, "16UC1", depth_mm)}
+            made[INFO] = camera_info(at_s, sequence.camera)
+            for topic, one in made.items():
+                data = store.serialize_cdr(one, to[topic].msgtype)
+                bag.write(to[topic], round(1e9 * at_s), data)
+
+
+def play(options: argparse.Namespace) -> None:
     """Publish frames as a camera does; prints the stamp of each that is sent."""
-    sequence, node, quality = open_sequence(path), DdsNode(domain), SENSOR._replace(reliable=True)
-    colours, depths = (node.writer(t, type_name("Image"), quality) for t in (COLOUR, DEPTH))
-    infos = node.writer(INFO, "sensor_msgs/msg/CameraInfo", LATCHED)
-    infos.send(camera_info(time.time(), sequence.camera))
-    due_s = time.monotonic()
-    for frame in islice(sequence.frames(first), frames):
-        time.sleep(max(due_s - time.monotonic(), 0))
-        due_s += 1 / rate_hz
-        now = time.time()
-        colours.send(image(now, "rgb8", frame.rgb))
-        depths.send(image(now, "32FC1", frame.depth_m.astype(np.float32)))
-        print(f"{now:.6f}", flush=True)
-    time.sleep(1)
+    node, quality = DdsNode(options.domain), SENSOR._replace(reliable=True)
+    with open_images(options.sequence, options.play) as images:
+        kinds = zip(images.topics, images.types, strict=True)
+        writers = [node.writer(topic, kind, quality) for topic, kind in kinds]
+        latched = [(node.writer(topic, kind, LATCHED), one) for topic, kind, one in images.once]
+        for writer, one in latched:
+            writer.send(one)
+        pairs = repeat(next(images.pairs)) if options.hold else images.pairs
+        due_s = time.monotonic()
+        for pair in islice(pairs, options.frames):
+            time.sleep(max(due_s - time.monotonic(), 0))
+            due_s += 1 / options.rate
+            now = time.time()
+            for writer, one in zip(writers, pair, strict=True):
+                one.header = header(now, one.header.frame_id)
+                writer.send(one)
+            print(f"{now:.6f}", flush=True)
+        time.sleep(1)
 
 
 class Player:
@@ -95,7 +174,7 @@ class Player:
         self.options, self.domain = options, domain
         self.sent: list[float] = []
 
-    def run(self, first: int, frames: int) -> subprocess.Popen[str]:
+    def run(self, first: int, frames: int, *more: str) -> subprocess.Popen[str]:
         """Play some frames."""
         words = [
             sys.executable,
@@ -110,6 +189,7 @@ class Player:
             self.options.rate,
             "--domain",
             self.domain,
+            *more,
         ]
         return subprocess.Popen(list(map(str, words)), stdout=subprocess.PIPE, text=True)
 
@@ -145,9 +225,9 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     heard: dict[str, list[float]] = defaultdict(list)
     live = subprocess.Popen(command)
     end_s = time.monotonic() + LONGEST_S
-    warm, parts = player.run(0, 10**6), [(0, options.frames)]
-    while not heard["/tf_static"] and live.poll() is None and time.monotonic() < end_s:
-        listen(readers, heard)  # the first frames are dropped while the processes start
+    warm, parts = player.run(0, 10**6, "--hold"), [(0, options.frames)]
+    while not heard["/bmask_slam/odometry"] and live.poll() is None and time.monotonic() < end_s:
+        listen(readers, heard)
     player.stop(warm, kill=True)
     if options.kill_after:
         parts = [(0, options.kill_after), (options.kill_after, options.frames - options.kill_after)]
@@ -190,6 +270,7 @@ def figures(
     ]
     return {
         "sent": len(sent),
+        "sent_hz": round(float(1 / np.median(np.diff(sent))), 1) if len(sent) > 1 else None,
         "answered": len(mine),
         "late": int(sum(delay > 1 / options.rate for delay in delays)),
         "delay_ms": np.round(1e3 * np.percentile(delays, (50, 95, 100)), 1).tolist()
@@ -213,6 +294,8 @@ def main() -> None:
     parser.add_argument("--domain", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs"))
     parser.add_argument("--play", type=int, metavar="FIRST", help="only play, from this frame on")
+    parser.add_argument("--hold", action="store_true", help="with --play: that frame all the time")
+    parser.add_argument("--make-bag", type=Path, metavar="BAG", help="folder of a bag to make")
     words = sys.argv[1:]
     own, live = (
         (words[: words.index("--")], words[words.index("--") + 1 :])
@@ -222,8 +305,11 @@ def main() -> None:
     options = parser.parse_args(own)
     options.live = live
     if options.play is not None:
-        play(options.sequence, options.play, options.frames, options.rate, options.domain)
+        play(options)
     else:
+        if options.make_bag:
+            make_bag(options.sequence, options.frames, options.make_bag)
+            options.sequence = options.make_bag
         print(json.dumps(measure(options), indent=1))
 
 

@@ -172,17 +172,17 @@ def _live(arguments: argparse.Namespace) -> int:
 def _live_on(arguments: argparse.Namespace, source: Source) -> int:
     """The command on a source that is open: one run, over ROS 2 others when that is asked for."""
     from bmask_slam.live.live_slam import LiveSlam
-    from bmask_slam.live.play import PlayOptions, play, ros2_ends
+    from bmask_slam.live.play import PlayOptions, finishing, play, ros2_ends
     from bmask_slam.live.sources.opening import ros2_of
 
     config = chosen_config(arguments).config
     options, ros2 = _live_options(arguments, source), ros2_of(source)
+    listener, services = None, None
     if ros2 is not None:
-        config = replace(config, sensors=ros2.mounted(config.sensors))
-    listener, services = (None, None) if ros2 is None else ros2_ends(ros2, arguments.ros2_params)
+        config, listener, services = ros2_ends(ros2, arguments.ros2_params, config)
     before: Path | None = None
     while True:
-        with LiveSlam(source.camera, config, options) as slam:
+        with finishing(LiveSlam(source.camera, config, options), listener, services) as slam:
             slam.source_counts = source.counts
             if ros2 is not None:
                 ros2.deliver = slam.add_measurements
@@ -193,8 +193,6 @@ def _live_on(arguments: argparse.Namespace, source: Source) -> int:
                 services.begin(before, slam.out)
             told = PlayOptions(not source.waits, quiet=arguments.quiet)
             ended_by = play(slam, source, told, listener, services)
-        if listener is not None:
-            listener.finish(slam)
         if ended_by or services is None or not services.reset_asked:
             if services is not None:
                 services.end(slam.out)

@@ -6,6 +6,7 @@ import logging
 import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, TypeAlias
@@ -22,6 +23,7 @@ from bmask_slam.runtime.progress import make_bar
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.sequences.prefetch import FEATURES_AHEAD, prefetched
+from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
 
 logger = logging.getLogger(__name__)
@@ -142,23 +144,48 @@ def _newest(
         newest.stop(STOP_S if stop.signal is None else 0.0)
 
 
-def ros2_ends(source: Ros2Source, params: Path | None) -> tuple[Ros2Publisher, Ros2Services]:
-    """What publishes the results to ROS 2, and what serves its calls.
+@contextmanager
+def finishing(
+    slam: LiveSlam, publisher: Ros2Publisher | None, services: Ros2Services | None
+) -> Iterator[LiveSlam]:
+    """A run, all of which is published once more when it has ended.
+
+    Also after an InputError, such as a source that has fallen silent, which is raised then.
+    """
+    failure: InputError | None = None
+    with slam:
+        try:
+            yield slam
+        except InputError as error:
+            failure = error
+    if publisher is not None:
+        publisher.finish(slam)
+    if failure is not None:
+        if services is not None:
+            services.end(slam.out)
+        raise failure
+
+
+def ros2_ends(
+    source: Ros2Source, params: Path | None, config: SystemConfig
+) -> tuple[SystemConfig, Ros2Publisher, Ros2Services]:
+    """The settings with the sensors' mountings, what publishes the results, what serves calls.
 
     Args:
         params: file with `Ros2Frames`, as YAML.
     """
     frames = resolve(Ros2Frames, params)
+    config = replace(config, sensors=source.mounted(config.sensors, frames))
     T, by_tf = frames.T_base_camera, False
     if T is None:
         T = source.T_base_camera(frames.base)
         by_tf = T is not None
-    wheels = "odometry" in source.sensors.names
     robot = Robot(
         OPTICAL if T is None else T,
         T is not None,
         by_tf,
-        source.sensors.T_odom_base if wheels else None,
+        source.sensors.T_odom_base if source.sensors.has_odometry else None,
         source.ros_time,
     )
-    return Ros2Publisher(source.node, frames, robot), Ros2Services(source.node, frames.prefix)
+    services = Ros2Services(source.node, frames.prefix)
+    return config, Ros2Publisher(source.node, frames, robot), services

@@ -24,7 +24,7 @@ from engine import NUMBERS, TOKENS, Make, Reader
 from fake_run import CAMERA as SMALL_CAMERA
 from fake_run import FakeSystem, make_sequence
 from recorded_bags import write_bag
-from ros2_player import example_message
+from ros2_messages import example_message
 from safetensors.torch import save
 from small_comparison import make_comparison
 from small_layouts import SMALL_LAYOUTS, SmallLayout, write_small
@@ -61,6 +61,7 @@ from bmask_slam.graph.trajectory_formats import (
     write_kitti,
 )
 from bmask_slam.live.ros2.sensors import ImageClock, Ros2Sensors
+from bmask_slam.live.ros2.tf import TF, RobotFrames
 from bmask_slam.live.ros2.transport import decoded, typestore
 from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
@@ -85,7 +86,6 @@ from bmask_slam.semantics.weights.checkpoints import load_network, read_state
 from bmask_slam.semantics.weights.stuff_weights import load_stuff
 from bmask_slam.semantics.weights.yolox_onnx import load_onnx
 from bmask_slam.sequences.bags.bag_file import open_bag
-from bmask_slam.sequences.bags.extrinsics import static_extrinsics
 from bmask_slam.sequences.bags.ros_images import (
     camera_of,
     colour_image,
@@ -93,6 +93,7 @@ from bmask_slam.sequences.bags.ros_images import (
     stamp_s,
 )
 from bmask_slam.sequences.bags.sensors import SensorTopics
+from bmask_slam.sequences.bags.transforms import static_extrinsics
 from bmask_slam.sequences.cameras import read_camera
 from bmask_slam.sequences.lists import read_associations, read_pairs
 from bmask_slam.sequences.sequence import open_sequence
@@ -651,9 +652,12 @@ def hear(path: Path) -> None:
     if WIRE[name] == "/tf_static":
         bag: Any = SimpleNamespace(path=path, messages=lambda _: [("/tf_static", message)])
         static_extrinsics(bag, "a", "b")
+        reader = SimpleNamespace(take=lambda _: [message])
+        node: Any = SimpleNamespace(published=lambda: {TF: name}, reader=lambda *_: reader)
+        RobotFrames(node, "here", lambda: [message]).odometry("ab", "abc", 0.0)
     elif WIRE[name]:
         reader = SimpleNamespace(broken=0, take=lambda _: [message, message])
-        node: Any = SimpleNamespace(published=lambda: {"/s": name}, reader=lambda *_: reader)
+        node = SimpleNamespace(published=lambda: {"/s": name}, reader=lambda *_: reader)
         sensors = Ros2Sensors(node, SensorTopics(**{WIRE[name]: "/s"}), 0.0)
         sensors.take(ImageClock(stamp_s(message.header), 0.0))
 

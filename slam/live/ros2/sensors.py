@@ -1,4 +1,4 @@
-"""Sensors beside the camera from running topics, and their mountings by /tf_static."""
+"""Sensors beside the camera from running topics, and their mountings by tf."""
 
 from __future__ import annotations
 
@@ -18,7 +18,14 @@ from bmask_slam.graph.sensors.odometry import interpolated
 from bmask_slam.graph.sensors.streams import Measurements, measurements
 from bmask_slam.live.ros2.transport import SENSOR, Node, Reader
 from bmask_slam.sequences.bags.ros_images import stamp_s
-from bmask_slam.sequences.bags.sensors import FIX, TYPES, SensorTopics, east_north_up, sensor_row
+from bmask_slam.sequences.bags.sensors import (
+    FIX,
+    ODOMETRY,
+    TYPES,
+    SensorTopics,
+    east_north_up,
+    sensor_row,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -43,7 +50,11 @@ _MOUNTINGS = {
 
 @dataclass
 class _Topic:
-    """A sensor's topic, its reader, the last stamp that was used, and the first satellite fix."""
+    """A sensor's topic, its reader, the last stamp that was used, and the first satellite fix.
+
+    ``broken``: messages so far that could not be decoded. ``measures``: it is handed on; else it
+    only says where the base is.
+    """
 
     sensor: str
     name: str
@@ -52,6 +63,8 @@ class _Topic:
     last_s: float = -np.inf
     frame: str = ""
     origin: Array | None = None
+    measures: bool = True
+    broken: int = 0
 
 
 @dataclass(frozen=True)
@@ -100,8 +113,20 @@ class Ros2Sensors:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The sensors that are heard."""
-        return tuple(topic.sensor for topic in self._topics)
+        """The sensors that measure."""
+        return tuple(topic.sensor for topic in self._topics if topic.measures)
+
+    @property
+    def has_odometry(self) -> bool:
+        """Whether ``T_odom_base`` may be known."""
+        return any(topic.sensor == "odometry" for topic in self._topics)
+
+    def add_odometry(self, name: str, reader: Reader, measures: bool) -> None:
+        """Hear nav_msgs/Odometry by another reader.
+
+        Without ``measures`` it only says where the base is.
+        """
+        self._topics.append(_Topic("odometry", name, ODOMETRY, reader, measures=measures))
 
     def frames(self) -> dict[str, str]:
         """The frame of each sensor by its first message, which is waited for; "" if it has none."""
@@ -114,23 +139,23 @@ class Ros2Sensors:
             if early:
                 is_base = topic.sensor == "odometry" and hasattr(early[0], "child_frame_id")
                 topic.frame = early[0].child_frame_id if is_base else early[0].header.frame_id
-        return {topic.sensor: topic.frame for topic in self._topics}
+        return {topic.sensor: topic.frame for topic in self._topics if topic.measures}
 
     def take(self, clock: ImageClock) -> list[Measurements]:
         """What was measured since the last call, on the images' clock; what is late is counted."""
         found = []
         for topic in self._topics:
             rows = []
-            broken = topic.reader.broken
             for message in [*self._early.pop(topic.sensor, ()), *topic.reader.take(KEPT)]:
                 row = self._row(topic, message, clock)
                 if row is not None:
                     rows.append(row)
-            self.broken += topic.reader.broken - broken
-            if rows:
+            self.broken += topic.reader.broken - topic.broken
+            topic.broken = topic.reader.broken
+            if rows and topic.sensor == "odometry":
+                self._recent = np.concatenate([self._recent, rows])[-RECENT:]
+            if rows and topic.measures:
                 found.append(Measurements(topic.sensor, np.array(rows)))
-                if topic.sensor == "odometry":
-                    self._recent = np.concatenate([self._recent, found[-1].rows])[-RECENT:]
         return found
 
     def _row(self, topic: _Topic, message: Any, clock: ImageClock) -> Array | None:
@@ -172,7 +197,7 @@ class Ros2Sensors:
 def mounted(
     config: SensorsConfig, frames: dict[str, str], T_camera: Callable[[str], Array | None]
 ) -> SensorsConfig:
-    """The settings, in which sensors whose mounting is the default get that of /tf_static.
+    """The settings, in which sensors whose mounting is the default get that of tf.
 
     Args:
         frames: of sensors by name; "" where it is not known.
@@ -186,14 +211,14 @@ def mounted(
         T = T_camera(frame) if frame else None
         if T is None:
             logger.warning(
-                "%s: /tf_static does not say where its frame %r is; the mounting is sensors.%s.%s",
+                "%s: tf does not say where its frame %r is; the mounting is sensors.%s.%s",
                 sensor, frame, sensor, name,
             )  # fmt: skip
             continue
         place = mounting_of(inverse(T) if sensor == "odometry" else T)
         if sensor == "position":
             place = place[:3]
-        logger.info("%s: by /tf_static, sensors.%s.%s=%s", sensor, sensor, name, list(place))
+        logger.info("%s: by tf, sensors.%s.%s=%s", sensor, sensor, name, list(place))
         config = replace(config, **{sensor: replace(section, **{name: place})})
     return config
 

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,16 +19,18 @@ from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.live.ros2.outputs import Ros2Frames
 from bmask_slam.live.ros2.sensors import ImageClock, Ros2Sensors, mounted
+from bmask_slam.live.ros2.tf import TF, RobotFrames
 from bmask_slam.live.ros2.transport import LATCHED, SENSOR, STATE, Node, Quality, Reader
 from bmask_slam.live.sources.message_frames import message_frames
 from bmask_slam.live.sources.pairing import DEPTH, RGB, Pair, Pairer
 from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
 from bmask_slam.sequences.bags.bag_file import INFO_TYPE, Bag, Topic
-from bmask_slam.sequences.bags.extrinsics import TRANSFORMS, static_extrinsics
 from bmask_slam.sequences.bags.ros_images import stamp_s
 from bmask_slam.sequences.bags.sensors import SensorTopics
 from bmask_slam.sequences.bags.topics import BagTopics, find_camera, find_topics, first_message
+from bmask_slam.sequences.bags.transforms import MAX_STATIC, TRANSFORMS
 from bmask_slam.sequences.frame import Frame
 
 logger = logging.getLogger(__name__)
@@ -65,6 +68,11 @@ class _Heard:
     def keep(self, name: str) -> None:
         """Receive only one topic from now on."""
         self._readers = {n: readers for n, readers in self._readers.items() if n == name}
+
+    def static(self) -> Iterator[Any]:
+        """The messages of /tf_static so far, after a wait for the first."""
+        received = (message for _, message in islice(self.messages(TRANSFORMS), MAX_STATIC))
+        return (message for message in received if hasattr(message, "transforms"))
 
     def _received(self, name: str, kind: str) -> list[Any]:
         if name not in self._readers:
@@ -146,39 +154,62 @@ class Ros2Source(MeasuredSource):
         self.camera = self._found.camera
         self._frame = first_message(heard, self._topics.rgb).header.frame_id.lstrip("/")
         self._heard.keep(TRANSFORMS)
+        self._robot = RobotFrames(self.node, name, self._heard.static)
         self._pairer = Pairer[Any](self.counts, self.camera.depth_time_offset_s)
         kinds, quality = self.node.published(), options.image_quality
         names = (self._topics.rgb, self._topics.depth)
         self._readers = [self.node.reader(name, kinds[name], quality) for name in names]
         self.sensors = Ros2Sensors(self.node, options.sensors, options.silence_s)
-        self._handed_s = 0.0
+        self._handed_s, self._to_say = 0.0, ""
         logger.info("%s: colour on %s, depth on %s", self._where, *names)
 
-    def mounted(self, config: SensorsConfig) -> SensorsConfig:
-        """The settings, with the mountings of /tf_static where they are left at the default.
+    def mounted(self, config: SensorsConfig, frames: Ros2Frames) -> SensorsConfig:
+        """The settings, with the mountings of tf where they are left at the default.
+
+        Where no topic of odometry is named and somebody publishes the base in ``odom`` on /tf,
+        that is odometry.
 
         Raises:
             InputError: a sensor is heard that is not enabled.
         """
+        given = frames.T_base_camera
+
+        def T_camera(frame: str) -> Array | None:
+            if given is not None and frame.lstrip("/") == frames.base.lstrip("/"):
+                return inverse(given)
+            return self.T_camera(frame)
+
+        if not self.sensors.has_odometry:
+            self._hear_odometry(config, frames, T_camera)
         for name in self.sensors.names:
             config.check_enabled(name)
-        return mounted(config, self.sensors.frames(), self.T_camera)
+        return mounted(config, self.sensors.frames(), T_camera)
+
+    def _hear_odometry(
+        self, config: SensorsConfig, frames: Ros2Frames, T_camera: Callable[[str], Array | None]
+    ) -> None:
+        """Hear odometry of /tf, if there is any; it is used if the camera's place is known."""
+        found = self._robot.odometry(frames.odom, frames.base, self._heard.expected_s)
+        if found is None:
+            return
+        own = config.odometry
+        is_set = own.camera_in_base != SensorsConfig().odometry.camera_in_base
+        use = own.enabled and (is_set or T_camera(frames.base) is not None)
+        why = "nothing says where the camera is" if own.enabled else "odometry is not enabled"
+        self._to_say = (
+            f"{self._where}: /tf has {frames.odom} -> {frames.base}, which is not published, and "
+            + ("used as odometry" if use else f"not used as odometry: {why}")
+        )
+        self.sensors.add_odometry(TF, found, use)
 
     def T_camera(self, frame: str) -> Array | None:
-        """T_camera_frame (4, 4) of the colour camera by /tf_static; None where it does not say."""
+        """T_camera_frame (4, 4) of the colour camera by tf; None where it does not say."""
         if self._frame == frame.lstrip("/"):
             return np.eye(4)
-        end_s, heard = time.monotonic() + self._heard.expected_s, cast("Bag", self._heard)
-        while True:
-            T = static_extrinsics(heard, self._frame, frame)
-            if T is not None or time.monotonic() > end_s:
-                return T
-            if TRANSFORMS not in self.node.published():
-                return None
-            time.sleep(10 * POLL_S)
+        return self._robot.mounting(self._frame, frame, self._heard.expected_s)
 
     def T_base_camera(self, base: str) -> Array | None:
-        """(4, 4) by /tf_static; None where it does not say."""
+        """(4, 4) by tf; None where it does not say."""
         T = self.T_camera(base)
         return None if T is None else inverse(T)
 
@@ -233,6 +264,10 @@ class Ros2Source(MeasuredSource):
         if not due or not np.isfinite(clock.latest_s):
             return
         self._handed_s = now_s
+        if self._to_say:  # now the run's log is open
+            logger.info(self._to_say)
+            self._to_say = ""
+        self._robot.hear()
         for measured in self.sensors.take(ImageClock(clock.latest_s, clock.shift_s)):
             self.deliver(measured)
         self.counts.late_measurements = self.sensors.late

@@ -18,14 +18,14 @@ from bmask_slam.graph.sensors.streams import Measurements, measurements
 from bmask_slam.sequences.bags.bag_file import open_bag
 from bmask_slam.sequences.bags.ros_images import stamp_s
 
-_IMU, _ODOMETRY = "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
+_IMU, ODOMETRY = "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
 FIX, _POSE = "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PoseStamped"
 _POINT = "geometry_msgs/msg/PointStamped"
 TYPES: dict[str, tuple[str, ...]] = {
     "imu": (_IMU,),
     "accelerometer": (_IMU,),
-    "odometry": (_ODOMETRY, _POSE),
-    "position": (FIX, _POSE, _POINT, _ODOMETRY),
+    "odometry": (ODOMETRY, _POSE),
+    "position": (FIX, _POSE, _POINT, ODOMETRY),
 }
 """The types of messages that each sensor may have."""
 WGS84_A_M, WGS84_E2 = 6378137.0, 6.69437999014e-3
@@ -133,7 +133,7 @@ _ROWS: dict[str, Callable[[Any, str], list[float]]] = {
 
 
 def _pose(message: Any, kind: str) -> Any:
-    return message.pose.pose if kind == _ODOMETRY else message.pose
+    return message.pose.pose if kind == ODOMETRY else message.pose
 
 
 def _xyz(vector: Any) -> list[float]:

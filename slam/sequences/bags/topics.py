@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences.bags.bag_file import IMAGE_TYPES, INFO_TYPE, Bag
-from bmask_slam.sequences.bags.extrinsics import sdk_extrinsics, static_extrinsics
 from bmask_slam.sequences.bags.ros_images import (
     DEPTH_SCALES,
     camera_of,
@@ -19,6 +18,7 @@ from bmask_slam.sequences.bags.ros_images import (
     depth_encoding,
     depth_image,
 )
+from bmask_slam.sequences.bags.transforms import sdk_extrinsics, static_extrinsics
 from bmask_slam.sequences.camera_presets import is_preset
 from bmask_slam.sequences.cameras import given_camera, read_camera
 from bmask_slam.sequences.checks import check_depth_scale, check_sizes

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
+import signal
+import threading
 import time
 from pathlib import Path
 
@@ -14,7 +13,19 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 
-from ros2_player import BEGIN_S, T_BASE_CAMERA, T_ODOM_MAP, example_message, info, pose
+from ros2_messages import example_message
+from ros2_player import (
+    BEGIN_S,
+    PLACES,
+    T_BASE_CAMERA,
+    T_ODOM_MAP,
+    Player,
+    T_odom_base,
+    info,
+    place,
+    pose,
+)
+from ros2_processes import LOOPBACK, begin_process
 
 from bmask_slam.cli import main
 from bmask_slam.config.configuration import resolve
@@ -31,6 +42,7 @@ from bmask_slam.live.ros2.dds import DdsNode, carried_type, dds_name, ros_name
 from bmask_slam.live.ros2.messages import ros_covariance
 from bmask_slam.live.ros2.outputs import OPTICAL, Ros2Frames
 from bmask_slam.live.ros2.transport import SENSOR, STATE, Quality, typestore
+from bmask_slam.live.sources import opening
 from bmask_slam.live.sources.opening import SourceOptions, open_source
 from bmask_slam.system_config import SystemConfig
 
@@ -42,17 +54,15 @@ TYPES = (
     "diagnostic_msgs/msg/DiagnosticArray", "vision_msgs/msg/Detection3DArray",
     "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PointStamped",
+    *(f"std_srvs/srv/{name}_{way}" for name in ("Trigger", "SetBool")
+      for way in ("Request", "Response")),
 )  # fmt: skip
-LOOPBACK = """<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterface name="lo"
-multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast></General><Discovery>
-<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>20</MaxAutoParticipantIndex>
-<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 DOMAIN, FRAMES = 77, 10
 
 
 @pytest.mark.parametrize("name", TYPES)
 def test_bytes_are_those_of_rosbags(name: str) -> None:
-    for seed in range(3):
+    for seed in range(6):
         ours = example_message(name, np.random.default_rng(seed), True)
         theirs = example_message(name, np.random.default_rng(seed))
         expected = bytes(typestore().serialize_cdr(theirs, name))
@@ -102,6 +112,22 @@ def test_other_domains_are_refused(text: str) -> None:
         open_source(text, SourceOptions(silence_s=0.1))
 
 
+def test_the_domain_is_that_of_the_environment_or_given(monkeypatch) -> None:
+    def join(domain: int) -> None:
+        raise InputError(f"joined {domain}.")
+
+    monkeypatch.setattr(opening, "DdsNode", join)
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    for variable, text, expected in (
+        ("", "ros2:", "joined 0"), ("42", "ros2:", "joined 42"), ("42", "ros2:7", "joined 7"),
+        ("x", "ros2:", "'x' is no domain"),
+    ):  # fmt: skip
+        if variable:
+            monkeypatch.setenv("ROS_DOMAIN_ID", variable)
+        with pytest.raises(InputError, match=rf"{expected}\b"):
+            open_source(text, SourceOptions())
+
+
 @pytest.mark.parametrize("sent", [SENSOR, STATE], ids=["best effort", "reliable"])
 def test_images_are_taken_of_best_effort_as_ros_sends_them(sent: Quality, monkeypatch) -> None:
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
@@ -117,13 +143,45 @@ def test_images_are_taken_of_best_effort_as_ros_sends_them(sent: Quality, monkey
     assert heard[0].header.stamp.sec == 12
 
 
+def test_compressed_images_become_frames(monkeypatch) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    player, ended = Player(DdsNode(DOMAIN + 5), compressed=True), threading.Event()
+
+    def play() -> None:
+        k = 0
+        while not ended.wait(0.1):
+            player.play(k)
+            k += 1
+
+    playing = threading.Thread(target=play)
+    playing.start()
+    try:
+        options = SourceOptions(silence_s=60, reliable=True)
+        source = open_source(f"ros2:{DOMAIN + 5}", options)
+        frame = next(source.frames())
+    finally:
+        ended.set()
+        playing.join(10)
+    sent = player.rendered[place(round(30 * (frame.timestamp_s - BEGIN_S)))]
+    off = np.abs(frame.rgb.astype(int) - sent.rgb)
+    assert 0 < off.mean() < 3  # of JPEG
+    assert np.nanmax(np.abs(frame.depth_m - sent.depth_m)) < 0.00051
+    assert np.array_equal(np.isnan(frame.depth_m), np.isnan(sent.depth_m))
+
+
+def check_poses(odometry: list[dict]) -> None:
+    """Received poses of the base are those of the player's frames."""
+    for one in odometry:
+        k = round(30 * (one["stamp_s"] - BEGIN_S))
+        R = rotation_from_quaternion(np.array(one["quaternion"]))
+        found = make_pose(R, np.array(one["position"]))
+        expected = T_BASE_CAMERA @ inverse(pose(0)) @ pose(k) @ inverse(T_BASE_CAMERA)
+        assert np.allclose(found, expected, atol=0.003)
+
+
 def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
-    helpers = Path(__file__).parents[3] / "helpers"
-    path = os.pathsep.join([str(helpers), *filter(None, sys.path)])
-    words = [sys.executable, helpers / "ros2_player.py", DOMAIN, 10, tmp_path / "heard"]
-    env = {**os.environ, "PYTHONPATH": path}
-    with subprocess.Popen(list(map(str, words)), env=env, stdin=subprocess.PIPE) as player:
+    with begin_process("ros2_player", DOMAIN, 10, tmp_path / "heard") as player:
         out = tmp_path / "run"
         options = (
             "--segmenter",
@@ -145,12 +203,11 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
     odometry = heard["/bmask_slam/odometry"]
     assert len(odometry) >= FRAMES - 4  # of best effort
     assert {(o["frame"], o["child"]) for o in odometry} == {("map", "base_link")}
-    for one in odometry:
-        k = round(30 * (one["stamp_s"] - BEGIN_S))
-        R = rotation_from_quaternion(np.array(one["quaternion"]))
-        found = make_pose(R, np.array(one["position"]))
-        expected = T_BASE_CAMERA @ inverse(pose(0)) @ pose(k) @ inverse(T_BASE_CAMERA)
-        assert np.allclose(found, expected, atol=0.003)
+    check_poses(odometry)
+    for topic in ("/bmask_slam/odometry", "/bmask_slam/pose"):
+        received = np.array([one["covariance"] for one in heard[topic][1:]]).reshape(-1, 6, 6)
+        sigmas = np.sqrt(np.linalg.eigvalsh(received))  # the first begins the map and has none
+        assert np.all((sigmas > 1e-6) & (sigmas < 0.03))  # rad, m
     links = {tuple(link) for tf in heard["/tf"] + heard["/tf_static"] for link in tf["links"]}
     assert links == {("map", "odom"), ("base_link", "camera")}  # the second is the player's
     assert np.allclose(heard["/tf"][-1]["moved"], inverse(T_ODOM_MAP)[:3, 3], atol=0.003)
@@ -163,3 +220,63 @@ def test_a_second_process_plays_frames_and_hears_poses(tmp_path: Path, monkeypat
     assert len(heard["/bmask_slam/pose"]) == len(odometry)
     mounting = resolve(SystemConfig, out / "config.yaml").sensors.odometry.camera_in_base
     assert np.allclose(T_of(mounting), T_BASE_CAMERA)
+
+
+def test_odometry_of_a_second_process_by_tf_and_other_frames(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    out, domain = tmp_path / "run", DOMAIN + 6
+    params = tmp_path / "params.yaml"
+    params.write_text("map: world\ntf_ahead_s: 0.2\n")
+    options = ("--segmenter", "none", "--calibrate", "off", "--quiet", "--silence", "60",
+               "--ros2-params", str(params))  # fmt: skip
+    with begin_process("ros2_player", domain, 10, tmp_path / "heard", "--tf") as player:
+        code = main(["live", f"ros2:{domain}", "--out", str(out), "--max-frames", str(FRAMES - 2),
+                     "--reliable", *options])  # fmt: skip
+        player.communicate(timeout=60)
+        assert (code, player.returncode) == (0, 0)
+    heard = json.loads((tmp_path / "heard").read_text())
+    check_poses(heard["/bmask_slam/odometry"])
+    assert {one["frame"] for one in heard["/bmask_slam/odometry"]} == {"world"}
+    log = (out / "log.txt").read_text()
+    assert log.count("/tf has odom -> base_link, which is not published, and used as odometry") == 1
+    mounting = resolve(SystemConfig, out / "config.yaml").sensors.odometry.camera_in_base
+    assert np.allclose(T_of(mounting), T_BASE_CAMERA)
+    moved = {"odom": [], "base_link": []}  # type: ignore[var-annotated]
+    for one in heard["/tf"]:
+        for link, at in zip(one["links"], one["moved"], strict=True):
+            assert link in (["odom", "base_link"], ["world", "odom"])
+            moved[link[1]].append(at)
+    assert np.allclose(moved["odom"][-1], inverse(T_ODOM_MAP)[:3, 3], atol=0.003)
+    wheels = np.array([T_odom_base(k)[:3, 3] for k in range(PLACES)])
+    off_m = np.linalg.norm(wheels[:, None] - moved["base_link"], axis=2).min(axis=0)
+    assert off_m.max() < 1e-9  # the wheels' own alone
+
+
+def test_a_player_is_killed_and_started_again(tmp_path: Path, monkeypatch) -> None:
+    """The second one's first frame is where the first one began, 3 s later."""
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    again, out, players, ended = 90, tmp_path / "run", [], threading.Event()
+
+    def play() -> None:
+        for name, *words in (("killed", "--die-after", 3), ("again", "--first", again)):
+            if not ended.is_set():
+                given = DOMAIN + 4, 10, tmp_path / name, *words
+                players.append(begin_process("ros2_player", *given))
+                players[-1].wait(600)
+
+    playing = threading.Thread(target=play)
+    playing.start()
+    options = ("--segmenter", "none", "--calibrate", "off", "--quiet", "--silence", "300")
+    code = main(["live", f"ros2:{DOMAIN + 4}", "--out", str(out), "--max-frames", str(2 * FRAMES),
+                 "--odometry-topic", "/odom", "--reliable", *options])  # fmt: skip
+    ended.set()
+    players[-1].communicate(timeout=60)
+    playing.join(60)
+    assert code == 0
+    assert [player.returncode for player in players] == [-signal.SIGKILL, 0]
+    odometry = json.loads((tmp_path / "again").read_text())["/bmask_slam/odometry"]
+    assert len(odometry) >= 3
+    assert all(one["stamp_s"] >= BEGIN_S + again / 30 for one in odometry)
+    check_poses(odometry)
+    saved = np.loadtxt(out / "trajectory.txt", ndmin=2)[:, 0]
+    assert saved.min() < BEGIN_S + 1 < BEGIN_S + again / 30 <= saved.max()

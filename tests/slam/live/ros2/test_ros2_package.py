@@ -82,6 +82,20 @@ def test_parameters_and_topics_are_known(modules) -> None:
     assert set(shown) <= published(modules).keys()
 
 
+def test_what_the_parameters_need_is_said_to_be_installed() -> None:
+    """Of package.xml and docs/live.md: the dense map, masks, and messages without cyclonedds."""
+    options = read_yaml(PACKAGE / "config" / "params.yaml")["bmask_slam"]["ros__parameters"][
+        "options"
+    ]
+    assert "--map" in options
+    docs = (ROOT / "docs" / "live.md").read_text()
+    texts = (PACKAGE / "package.xml").read_text(), docs[docs.index("### With ROS") :]
+    for text in texts:
+        extras = re.search(r"pip install 'bmask-slam\[([\w,]+)\]'", text)
+        assert extras is not None
+        assert extras[1].split(",") == ["semantics", "dense", "ros"]
+
+
 def test_a_package_that_ros_lacks_costs_its_topics_only(modules) -> None:
     node = FakeNode({})
     transport = modules("transport", node, without="vision_msgs")

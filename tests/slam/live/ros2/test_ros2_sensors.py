@@ -43,7 +43,7 @@ class StandIn:
         class Reader:
             broken = node.broken
 
-            def take(self, _: int) -> list[Any]:
+            def take(self, _: int = 0) -> list[Any]:
                 taken = list(queue)
                 queue.clear()
                 return taken

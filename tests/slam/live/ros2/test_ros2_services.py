@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +12,7 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 
-from test_ros2 import LOOPBACK
+from ros2_processes import LOOPBACK, begin_process
 from test_ros2_maps import T_MAP_WORLD, Run, room, some_objects
 from test_ros2_sensors import StandIn
 
@@ -23,6 +20,7 @@ from bmask_slam.cli import main
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import make_pose, se3_exp, transform
 from bmask_slam.live.messages import MapSaved
+from bmask_slam.live.play import finishing
 from bmask_slam.live.ros2 import services as services_module
 from bmask_slam.live.ros2.dds import CALL_BYTES, HEADER_BYTES, DdsService, carried_type
 from bmask_slam.live.ros2.grid import LiveCloud
@@ -197,12 +195,8 @@ def test_a_call_has_its_number_before_its_fields() -> None:
 
 def test_a_second_process_calls_each_service(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
-    helpers = Path(__file__).parents[3] / "helpers"
-    path = os.pathsep.join([str(helpers), *filter(None, sys.path)])
     calls = ["localise_only=on", "save_map", "localise_only=off", "reset"]
-    words = [sys.executable, helpers / "ros2_player.py", DOMAIN, 20, tmp_path / "heard", *calls]
-    env = {**os.environ, "PYTHONPATH": path}
-    with subprocess.Popen(list(map(str, words)), env=env, stdin=subprocess.PIPE) as player:
+    with begin_process("ros2_player", DOMAIN, 20, tmp_path / "heard", *calls) as player:
         out = tmp_path / "run"
         options = ("--segmenter", "none", "--calibrate", "off", "--quiet", "--silence", "60")
         options += ("--reliable",)  # on a full machine of best effort hardly an image is whole
@@ -239,6 +233,31 @@ def test_the_cloud_follows_its_keyframes_and_is_thinned() -> None:
     assert len(found) == 2
     assert colours[:, 2].tolist() == [9, 9]  # the newest
     assert cloud.cloud({6: T}) is None  # the keyframes were culled
+
+
+class Ending(Run):
+    """A run that makes a submap when it is closed, as the last dense map does."""
+
+    out = Path("/nowhere/run")
+
+    def __enter__(self) -> Ending:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.listeners[0](4, room(2.02), np.zeros((len(room(2.02)), 3), np.uint8))
+
+
+def test_everything_is_published_when_the_source_falls_silent() -> None:
+    ros, run = node(), Ending()
+    publish = Ros2Publisher(ros, Ros2Frames(), Robot(T_MAP_WORLD, True))
+    services, call = Ros2Services(ros, "/x"), Call(TRIGGER(0))
+    with pytest.raises(InputError, match="no frame"), finishing(run, publish, services) as slam:
+        publish(FrameResult(0, 5.0, TrackingStatus.OK, np.eye(4)), slam)
+        ros.calls["save_map"] += [call]
+        raise InputError("no frame for 10 s")
+    assert ros.topics["/bmask_slam/cloud"][-1].width > 100
+    assert ros.topics["/bmask_slam/map"][-1].info.width > 20
+    assert call.answers == [(False, ENDED)]
 
 
 def test_another_run_begins_with_an_empty_map() -> None:
