@@ -19,7 +19,7 @@ from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import check_name
 from bmask_slam.graph.files.json_file import STRICT, Name, first_problem, read_json
-from bmask_slam.semantics.instances.run_lengths import encoded_lengths
+from bmask_slam.semantics.instances.run_lengths import checked_lengths
 from bmask_slam.semantics.labels import LabelSet, label_set
 
 logger = logging.getLogger(__name__)
@@ -244,7 +244,12 @@ def _encoded(
     if given is None:
         raise ValueError("no segmentation")
     if isinstance(given, _RunLengths):
-        runs = encoded_lengths(given.counts, given.size, [image.height, image.width])
+        lengths = checked_lengths(given.counts, given.size, [image.height, image.width])
+        if isinstance(given.counts, str):
+            runs = {"size": given.size, "counts": given.counts.encode("ascii")}
+        else:
+            plain = {"size": given.size, "counts": lengths.tolist()}
+            runs = coco_mask.frPyObjects(plain, image.height, image.width)
     else:
         polygons = [_polygon(points, edges) for points in given]
         good = [points for points in polygons if points is not None]

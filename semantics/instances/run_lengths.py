@@ -1,17 +1,24 @@
-"""COCO's run lengths of masks, checked before pycocotools gets them, which checks nothing."""
+"""COCO's run lengths of masks, plain and compressed; those of files are checked."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from pycocotools import mask as coco_mask
 
-from bmask_slam.graph.arrays import Ints
+from bmask_slam.graph.arrays import Ints, Mask
 
 
-def encoded_lengths(counts: str | list[int], given: list[int], size: list[int]) -> dict[str, Any]:
-    """Compressed run lengths of a mask of ``size`` (H, W) from compressed or plain ones.
+def run_lengths(mask: Mask) -> list[int]:
+    """COCO's uncompressed run lengths: columns one after the other, zeros first."""
+    flat = mask.ravel(order="F")
+    changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+    ends = np.r_[changes, flat.size]
+    starts = np.r_[0, changes]
+    counts = (ends - starts).tolist()
+    return [0, *counts] if flat[0] else counts
+
+
+def checked_lengths(counts: str | list[int], given: list[int], size: list[int]) -> Ints:
+    """The run lengths (N,) of a mask of ``size`` (H, W), from compressed or plain ones.
 
     Raises:
         ValueError: a mask of another size, or lengths that do not add up to its pixels.
@@ -19,13 +26,9 @@ def encoded_lengths(counts: str | list[int], given: list[int], size: list[int]) 
     if given != size:
         raise ValueError(f"a mask of size {given} in {size}")
     lengths = decoded_lengths(counts) if isinstance(counts, str) else np.array(counts, np.int64)
-    height, width = size
-    if lengths.sum() != height * width or lengths.min(initial=0) < 0:
-        raise ValueError(f"run lengths that do not add up to {height * width} pixels")
-    if isinstance(counts, str):
-        return {"size": size, "counts": counts.encode("ascii")}
-    plain = {"size": size, "counts": lengths.tolist()}
-    return dict(coco_mask.frPyObjects(plain, height, width))
+    if lengths.sum() != size[0] * size[1] or lengths.min(initial=0) < 0:
+        raise ValueError(f"run lengths that do not add up to {size[0] * size[1]} pixels")
+    return lengths
 
 
 def decoded_lengths(text: str) -> Ints:

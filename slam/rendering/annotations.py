@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Array, Mask
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.rendering.engine.builder import UNLABELLED, SceneBuilder
 from bmask_slam.rendering.engine.scene import Scene
+from bmask_slam.semantics.instances.run_lengths import run_lengths
 from bmask_slam.semantics.labels import read_label_set
 
 CLASSES: tuple[str, ...] = read_label_set("paper").names[1:]
@@ -46,16 +47,6 @@ def visible_instances(instances: NDArray[np.uint16]) -> list[VisibleInstance]:
         box = (x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1)
         visible.append(VisibleInstance(i, area, box, run_lengths(mask)))
     return visible
-
-
-def run_lengths(mask: Mask) -> list[int]:
-    """COCO's uncompressed run lengths: columns one after the other, zeros first."""
-    flat = mask.ravel(order="F")
-    changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
-    ends = np.r_[changes, flat.size]
-    starts = np.r_[0, changes]
-    counts = (ends - starts).tolist()
-    return [0, *counts] if flat[0] else counts
 
 
 def coco(

@@ -16,7 +16,7 @@ from repository import shared
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances import coco_files
 from bmask_slam.semantics.instances.coco_files import read_coco
-from bmask_slam.semantics.instances.run_lengths import decoded_lengths
+from bmask_slam.semantics.instances.run_lengths import decoded_lengths, run_lengths
 
 SQUARE = [2.0, 3.0, 6.0, 3.0, 6.0, 9.0, 2.0, 9.0]
 
@@ -151,6 +151,12 @@ def test_impossible_images_are_refused(tmp_path: Path, change: dict[str, Any], w
     with pytest.raises(InputError, match=r"c\.json: ") as caught:
         read_coco(path)
     assert words in str(caught.value)
+
+
+def test_run_lengths_start_with_zeros() -> None:
+    mask = np.array([[True, False], [True, True]])
+    assert run_lengths(mask) == [0, 2, 1, 1]
+    assert run_lengths(~mask) == [2, 1, 1]
 
 
 @settings(deadline=None)

@@ -19,7 +19,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.yaml_file import read_yaml
 from bmask_slam.graph.geometry import inverse, rotation_from_quaternion, so3_exp, so3_log, transform
 from bmask_slam.rendering import sequence as renderer
-from bmask_slam.rendering.annotations import CATEGORY_IDS, run_lengths
+from bmask_slam.rendering.annotations import CATEGORY_IDS
 from bmask_slam.rendering.engine.atlas import build_atlas
 from bmask_slam.rendering.engine.meshes import quad
 from bmask_slam.rendering.engine.path import CameraPath, camera_poses, look_at
@@ -172,12 +172,6 @@ def test_annotations_agree_with_the_instance_pictures(sequence: Path) -> None:
 def test_people_are_visible_and_labelled(sequence: Path) -> None:
     content = json.loads((sequence / "annotations.json").read_text())
     assert any(a["category_id"] == PERSON and a["area"] > 100 for a in content["annotations"])
-
-
-def test_run_lengths_start_with_zeros() -> None:
-    mask = np.array([[True, False], [True, True]])
-    assert run_lengths(mask) == [0, 2, 1, 1]
-    assert run_lengths(~mask) == [2, 1, 1]
 
 
 def test_normals_face_the_camera(sequence: Path) -> None:
