@@ -42,6 +42,7 @@ from bmask_slam.dense.folder import LABEL_FILE, DenseFolder
 from bmask_slam.dense.growing.store import FRAME_FILE, FrameStore
 from bmask_slam.dense.saved_map import read_saved_map
 from bmask_slam.evaluation import frame_stamps
+from bmask_slam.evaluation.reference import TruthBody, find_truth_body
 from bmask_slam.events import read_events
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.errors import InputError
@@ -60,6 +61,8 @@ from bmask_slam.graph.trajectory_formats import (
     write_euroc,
     write_kitti,
 )
+from bmask_slam.live.network.connection import read_token
+from bmask_slam.live.ros2.outputs import Ros2Frames
 from bmask_slam.live.ros2.sensors import ImageClock, Ros2Sensors
 from bmask_slam.live.ros2.tf import TF, RobotFrames
 from bmask_slam.live.ros2.transport import decoded, typestore
@@ -82,6 +85,8 @@ from bmask_slam.semantics.instances.coco_files import read_coco
 from bmask_slam.semantics.instances.image_files import decode_image, read_colour
 from bmask_slam.semantics.instances.surface_files import read_surfaces, surface_labels
 from bmask_slam.semantics.labels import label_set, read_label_set
+from bmask_slam.semantics.segmenters.mask_cache import CacheOptions, cache_masks
+from bmask_slam.semantics.segmenters.segmenter import LabelImageSegmenter, NoSegmenter
 from bmask_slam.semantics.weights.checkpoints import load_network, read_state
 from bmask_slam.semantics.weights.stuff_weights import load_stuff
 from bmask_slam.semantics.weights.yolox_onnx import load_onnx
@@ -480,6 +485,16 @@ def read_evidence(path: Path) -> None:
     dense.evidence(1)
 
 
+def read_label_image(path: Path) -> None:
+    labels = label_set(("b", "cup", "chair"))
+    LabelImageSegmenter(path.parent, labels).segment(np.zeros((8, 10, 3), np.uint8), "a.png")
+
+
+def read_mask_settings(path: Path) -> None:
+    no_images: list[tuple[str, Path]] = []
+    cache_masks(NoSegmenter(), no_images, CacheOptions(path.parent, {"name": "x"}), lambda *_: None)
+
+
 EIGHT_BY_SIX = replace(CAMERA, width=8, height=6)
 
 
@@ -699,6 +714,10 @@ def text_readers(folder: Path) -> list[Reader]:
         Reader("odometry", "a.txt", lambda p: read_measurements(p, "odometry"), (tum,)),
         Reader("position", "a.txt", lambda p: read_measurements(p, "position"),
                (b"1.0 2 3 4 0.5\n2.0 2 3 4\n",)),
+        Reader("accelerometer", "a.txt", lambda p: read_measurements(p, "accelerometer"),
+               (b"1.0 0.1 9.8 0.2\n2.0 0.1 9.8 0.1\n",)),
+        Reader("IMU", "imu.csv", lambda p: read_measurements(p, "imu"),
+               (b"#timestamp\n1000000000,0.1,0,0,0,9.8,0\n1005000000,0.1,0,0,0,9.8,0\n",)),
         Reader("any trajectory", "a.txt", partial(read_trajectory, stamps_s=path.timestamps_s),
                (tum, kitti, euroc)),
         Reader("stamps", "times.txt", read_times, (b"0.1\n0.2\n0.3\n", tum)),
@@ -716,6 +735,7 @@ def text_readers(folder: Path) -> list[Reader]:
         Reader("precision_recall.csv", "p.csv", read_precision, (curves,)),
         Reader("label set", "labels.txt", as_text(read_label_set), (b"cup\n# no\nN/A\nchair\n",)),
         Reader("classes of surfaces", "c.txt", read_surface_names, (b"wall\nfloor\n# no\ndoor\n",)),
+        Reader("token", "token", read_token, (b"abcdefghijklmnopqrstuvwxyz\n",)),
         Reader("SHA256SUMS", "SHA256SUMS", read_sums, (b"ab  a.tgz\ncd  b.tgz\n",)),
         Reader("config.yaml's sequence", "config.yaml", in_folder(find_sequence),
                (b"# bmask-slam 0.1, sequence /nowhere/s, stride 1\n",)),
@@ -745,12 +765,18 @@ def document_readers(folder: Path) -> list[Reader]:
         Reader("camera.yaml", "camera.yaml", read_camera, (SMALL_CAMERA.encode(),), yaml_maker),
         Reader("configuration", "c.yaml", lambda p: resolve(SystemConfig, p),
                (dump(CONFIG).encode()[:1500], b"tracking: {min_inliers: 20}\n"), yaml_maker),
+        Reader("ROS 2 parameters", "p.yaml", lambda p: resolve(Ros2Frames, p),
+               (b"base: base_link\nT_base_camera: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n",),
+               yaml_maker),
+        Reader("groundtruth.yaml", "groundtruth.yaml", in_folder(find_truth_body),
+               (TruthBody().yaml().encode(),), yaml_maker),
         Reader("movability priors", "p.yaml", as_text(read_priors), (priors,), yaml_maker),
         Reader("sizes of classes", "s.yaml", read_class_sizes, (b"cup: [0.1, 0.2, top]\n",),
                sizes_maker),
         Reader("catalogue", "c.yaml", read_catalogue, (sets,), yaml_maker),
         Reader("experiment", "e.yaml", read_experiment, (experiment,), yaml_maker),
         of_json("COCO", "annotations.json", read_masks, coco()),
+        of_json("settings of masks", "settings.json", read_mask_settings, b'{"name": "x"}'),
         of_json("objects.json", "objects.json", in_folder(read_objects), objects()),
         of_json("markers.json", "markers.json", read_markers, markers()),
         of_json("metrics.json", "metrics.json", in_folder(lambda p: Run(p).metrics), metrics),
@@ -844,6 +870,12 @@ def binary_readers(folder: Path) -> list[Reader]:
     database = bag_folder(recorded["a.db3"], recorded["db"].decode())
     return [
         Reader("image", "1.png", both_pictures, images()),
+        Reader(
+            "label image",
+            "a.png",
+            read_label_image,
+            (cv2.imencode(".png", np.arange(80, dtype=np.uint16).reshape(8, 10) % 3)[1].tobytes(),),
+        ),
         Reader("surfaces", "1.png", read_surface_image, surface_images(), surfaces_maker),
         Reader("archive", "a.tgz", unpacked, packed, zip_maker),
         Reader("ROS 1 bag", "a.bag", read_bag, (recorded["a.bag"],)),
