@@ -412,6 +412,10 @@ def network_maker(rng: random.Random) -> bytes:
     return save({"a": torch.zeros(1)}, metadata)
 
 
+def label_image() -> bytes:
+    return cv2.imencode(".png", np.arange(80, dtype=np.uint16).reshape(8, 10) % 3)[1].tobytes()
+
+
 def surfaces_maker(rng: random.Random) -> bytes:
     """Sound PNGs of any shape, depth and classes."""
     shape = tuple(rng.choice((1, 2, 3, 4, 6, 200)) for _ in range(2)) + rng.choice(((), (), (3,)))
@@ -766,8 +770,7 @@ def document_readers(folder: Path) -> list[Reader]:
         Reader("configuration", "c.yaml", lambda p: resolve(SystemConfig, p),
                (dump(CONFIG).encode()[:1500], b"tracking: {min_inliers: 20}\n"), yaml_maker),
         Reader("ROS 2 parameters", "p.yaml", lambda p: resolve(Ros2Frames, p),
-               (b"base: base_link\nT_base_camera: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n",),
-               yaml_maker),
+               (b"base: base_link\nprefix: /slam\n",), yaml_maker),
         Reader("groundtruth.yaml", "groundtruth.yaml", in_folder(find_truth_body),
                (TruthBody().yaml().encode(),), yaml_maker),
         Reader("movability priors", "p.yaml", as_text(read_priors), (priors,), yaml_maker),
