@@ -16,6 +16,9 @@ from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
+MANY_BATCHES = 20
+"""Of landmarks that wait to be marginalised: so many never do while a run goes on."""
+
 
 @dataclass(frozen=True)
 class FactorSelectionConfig:
@@ -180,7 +183,8 @@ class FactorSelector:
     def _outside_window(self, world: WorldMap, observed_ids: Ints) -> Ints:
         """Landmarks in the graph that no keyframe of the active window observes, if enough.
 
-        Those not observed for longest come first.
+        Those not observed for longest come first, two batches of them; all where very many wait, as
+        in a large map that goes on after its last optimisation took all of them back.
         """
         count, landmarks = self.config.window_keyframes, world.landmarks
         if not count or len(world.keyframes) <= self.config.full_keyframes:
@@ -194,6 +198,8 @@ class FactorSelector:
         batch = self.config.marginalise_batch
         if len(waiting) < batch:
             return waiting[:0]
+        if len(waiting) > MANY_BATCHES * batch:
+            return waiting
         oldest = np.argsort(landmarks.last_keyframe[waiting], kind="stable")[: 2 * batch]
         return np.sort(waiting[oldest])
 

@@ -341,13 +341,16 @@ def test_a_small_map_keeps_every_landmark_in_the_graph() -> None:
     assert len(smoother.estimate().landmark_ids) == 2 * COUNT
 
 
-def test_at_most_two_batches_are_marginalised_at_once() -> None:
-    config = replace(WINDOWED, marginalise_batch=5)
+@pytest.mark.parametrize(("batch", "count"), [(7, 14), (1, 2 * COUNT)])
+def test_two_batches_are_marginalised_at_once_or_all_where_very_many_wait(
+    batch: int, count: int
+) -> None:
+    config = replace(WINDOWED, marginalise_batch=batch)
     world, factor_selection, _ = windowed_world(replace(config, full_keyframes=100))
     factor_selection.config = config
     features = make_features(pose_of(5), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
     update = factor_selection.keyframe_update(world, add_keyframe(world, pose_of(5), features))
-    assert len(update.marginalise_landmarks) == 10
+    assert len(update.marginalise_landmarks) == count
 
 
 def test_landmarks_outside_the_window_are_marginalised_and_restored() -> None:
