@@ -177,7 +177,7 @@ def test_every_shipped_configuration_runs(capsys, sequence: Path, tmp_path: Path
         (["run", "seq", "--config", "papper"], "papper.yaml: no such file; there are:"),
         (["run", "seq", "--stride", "0"], "--stride 0: must be"),
         (["run", "seq", "--out", "seq/rgb.txt"], "seq/rgb.txt: is a file"),
-        (["run", "seq", "--reference", "none.txt"], "none.txt: no such trajectory file"),
+        (["run", "seq", "--reference", "none.txt"], "none.txt: no such file"),
         (["info", "nowhere"], "nowhere: no such folder"),
         (["evaluate", "none.txt", "--reference", "seq"], "none.txt: no such file"),
         (["render", "attic", "--out", "x"], "choose one of office"),
