@@ -88,6 +88,7 @@ def test_a_process_that_is_killed_and_one_that_hangs_are_replaced_without_losing
             clock.pass_s(RestartPolicy.answer_s + 1)
             slam.catch_up()
         wait_for(slam, crashes=2)
+        wait_until(lambda: slam.catch_up() or slam.processes().get("dense", hanging) != hanging)
         pids = [killed, hanging, *slam.processes().values()]
     assert set(statuses) == {TrackingStatus.OK}
     assert len(set(pids)) == len(pids)

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 from chromium import DRAWING, EXECUTABLE, chromium
+from faults import LONG_S
 
 from bmask_slam.cli import main
 from bmask_slam.graph.arrays import Image
@@ -84,7 +85,7 @@ def viewed(run: Path, sequence: Path) -> Iterator[str]:
         assert process.poll() is None
     finally:
         process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 130
+        assert process.wait(LONG_S) == 130
         process.stdout.close()
 
 
