@@ -15,7 +15,7 @@ from pathlib import Path
 from bmask_slam.runtime.machine import describe_machine
 from bmask_slam.runtime.memory import memory_limit_bytes
 
-MEMINFO, CGROUP, SHM = Path("/proc/meminfo"), Path("/sys/fs/cgroup"), Path("/dev/shm")
+MEMINFO, CGROUP, SHM = Path("/proc/meminfo"), Path("/sys/fs/cgroup"), Path("/dev/shm")  # nosec B108
 TORCH_S = 120.0
 TORCH = """
 import json, torch
@@ -77,8 +77,8 @@ class Torch:
 def find_machine() -> Machine:
     """This machine, now."""
     limit = memory_limit_bytes()
-    # what graph/files/disk_arrays.py writes to
-    scratch = os.environ.get("TMPDIR") or ("/var/tmp" if Path("/var/tmp").is_dir() else "")
+    # what graph/files/disk_arrays.py writes to; here its free space is asked, nothing is written
+    scratch = os.environ.get("TMPDIR") or ("/var/tmp" if Path("/var/tmp").is_dir() else "")  # nosec B108
     folders = dict.fromkeys([str(Path.cwd()), scratch or tempfile.gettempdir()])
     return Machine(
         describe_machine(),
