@@ -15,6 +15,7 @@ from bmask_slam.graph.arrays import Array, Bytes, Image, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.whole_file import whole_file, writing
+from bmask_slam.semantics.instances.image_files import write_image
 
 BACKGROUND_COLOUR, WALL_COLOUR = (150, 150, 150), (70, 70, 80)
 WALL = "wall"
@@ -87,11 +88,7 @@ def with_legend(image: Image, names: Sequence[str], labels: Sequence[int]) -> By
 
 
 def write_picture(path: Path, image: Image) -> Path:
-    """Save an image (H, W, 3), red first; returns its path. Raises InputError if it cannot.
-
-    OpenCV would not say that the last bytes of a file found no space.
-    """
-    packed = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
+    """Save an image (H, W, 3), red first; returns its path. Raises InputError if it cannot."""
     with writing(path), whole_file(path) as temporary:
-        temporary.write_bytes(packed.tobytes())
+        write_image(temporary, image)
     return path

@@ -10,7 +10,7 @@ import numpy as np
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import check_name, target_below
 from bmask_slam.graph.whole_file import whole_file
-from bmask_slam.semantics.instances.image_files import decode_image
+from bmask_slam.semantics.instances.image_files import decode_image, write_image
 from bmask_slam.semantics.instances.surfaces import SurfaceClasses
 from bmask_slam.semantics.labels import LabelSet, read_label_set
 
@@ -36,10 +36,9 @@ def write_surfaces(folder: Path, name: str, seen: SurfaceClasses) -> None:
     if before is None:
         with whole_file(names) as temporary:
             temporary.write_text("\n".join(seen.labels.names[1:]) + "\n", encoding="utf-8")
-    data = cv2.imencode(".png", seen.codes())[1]
     target = target_below(folder, f"{FOLDER}/{name}").with_suffix(".png")
     with whole_file(target) as temporary:
-        temporary.write_bytes(data.tobytes())
+        write_image(temporary, seen.codes())
 
 
 def surface_labels(folder: Path) -> LabelSet | None:

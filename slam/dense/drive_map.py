@@ -153,7 +153,7 @@ def map_frame(saved: SavedMap, cloud: DenseCloud) -> tuple[Array, str]:
     limits_deg = (LABELLED_DEG, GUESS_DEG) if gravity is None else (GRAVITY_DEG, GRAVITY_DEG)
     facing = UPRIGHT_COSINE if gravity is None else np.cos(np.deg2rad(2 * GRAVITY_DEG))
     labelled = np.isin(cloud.labels, FLOORS)
-    for level, limit_deg in zip((labelled, labelled | True), limits_deg, strict=True):
+    for level, limit_deg in zip((labelled, np.ones_like(labelled)), limits_deg, strict=True):
         up = up_direction(normals[level], guess, limit_deg)
         floor = points[level & (normals @ up > facing)]
         if len(floor) >= MIN_FLOOR_POINTS:

@@ -261,17 +261,17 @@ class LoopCloser:
         """
         implied, own = implied_drift(loop, world), self.noise.covariance(loop)
 
-        def chi2_after(way: Array) -> float:
-            S = own + self.drift.covariance(way)
+        def chi2_with(S: Array) -> float:
             return float(mahalanobis(implied[None], S[None])[0])
 
-        gate = self.config.gate
-        if chi2_after(world.keyframes[loop.keyframe_b].T_world_camera[None]) < gate:
+        gate, here = self.config.gate, world.keyframes[loop.keyframe_b].T_world_camera[None]
+        if chi2_with(own + self.drift.covariance(here)) < gate:
             return True
         way = paths.way(*loop.ends)
         if not len(way):
             return True
-        if (chi2 := chi2_after(way)) < gate and not self.drift.alike_elsewhere(implied, own, way):
+        S = own + self.drift.covariance(way)
+        if (chi2 := chi2_with(S)) < gate and not self.drift.alike_elsewhere(implied, S):
             return True
         reason = f"{loop.inliers} inliers, but it implies more drift than is possible"
         self._events.loop_refused(loop.ends, reason)

@@ -63,18 +63,19 @@ class MapDrift:
         """Covariance (6, 6) of T_a_b, as a tangent in b, by a way's poses (N, 4, 4) from a to b."""
         return self._floor + self.scale * self._possible(way)
 
-    def alike_elsewhere(self, implied: Array, own: Array, way: Array) -> bool:
+    def alike_elsewhere(self, implied: Array, S: Array) -> bool:
         """Whether a loop is explained better by a place that looks alike than by drift.
 
-        Drift puts the camera (6,) ``implied`` away with a density that falls with the covariances
-        (6, 6) of the loop and of the way; places that look alike are one in ``alike_spacing_m``
-        cubed. The longer the way, the less tells even a loop that implies no drift.
+        Drift puts the camera (6,) ``implied`` away with a density that falls with S (6, 6), the
+        covariances of the loop and of the way; places that look alike are one in
+        ``alike_spacing_m`` cubed. The longer the way, the less tells even a loop that implies no
+        drift.
         """
         if not self.places_look_alike:
             return False
-        S = (own + self.covariance(way))[3:, 3:]
-        minus_2_log = float(mahalanobis(implied[None, 3:], S[None])[0])
-        minus_2_log += float(np.linalg.slogdet(2 * np.pi * S)[1])
+        moved, S_moved = implied[None, 3:], S[3:, 3:]
+        minus_2_log = float(mahalanobis(moved, S_moved[None])[0])
+        minus_2_log += float(np.linalg.slogdet(2 * np.pi * S_moved)[1])
         rules = self.config
         return minus_2_log > 2 * np.log(rules.alike_spacing_m**3 / rules.alike_odds)
 

@@ -246,10 +246,10 @@ def test_a_look_alike_must_be_less_likely_than_the_drift(
     """There and back, to a place beside where the map has it; after 250 m that tells nothing."""
     drift = MapDrift(NoiseConfig())
     way = np.concatenate([straight(length_m // 2), straight(length_m // 2)[-2::-1]])
-    given = np.array([0, 0, 0, implied_m, 0, 0]), STATED, way
-    assert not drift.alike_elsewhere(*given)
+    implied = np.array([0, 0, 0, implied_m, 0, 0])
+    assert not drift.alike_elsewhere(implied, STATED + drift.covariance(way))
     drift.places_look_alike = True
-    assert drift.alike_elsewhere(*given) == elsewhere
+    assert drift.alike_elsewhere(implied, STATED + drift.covariance(way)) == elsewhere
 
 
 def test_a_room_that_looks_like_another_is_no_loop() -> None:
