@@ -16,8 +16,9 @@ from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
-MANY_BATCHES = 20
-"""Of landmarks that wait to be marginalised: so many never do while a run goes on."""
+MANY_BATCHES = 300
+"""Of landmarks that wait to be marginalised: so many do not while a run goes on, nor when the map
+has outgrown ``full_keyframes``, from which on they wait."""
 
 
 @dataclass(frozen=True)

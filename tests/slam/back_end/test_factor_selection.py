@@ -343,8 +343,9 @@ def test_a_small_map_keeps_every_landmark_in_the_graph() -> None:
 
 @pytest.mark.parametrize(("batch", "count"), [(7, 14), (1, 2 * COUNT)])
 def test_two_batches_are_marginalised_at_once_or_all_where_very_many_wait(
-    batch: int, count: int
+    monkeypatch: pytest.MonkeyPatch, batch: int, count: int
 ) -> None:
+    monkeypatch.setattr("bmask_slam.back_end.factor_selection.MANY_BATCHES", 20)
     config = replace(WINDOWED, marginalise_batch=batch)
     world, factor_selection, _ = windowed_world(replace(config, full_keyframes=100))
     factor_selection.config = config
