@@ -33,7 +33,6 @@ from bmask_slam.mapping.products.occupancy_files import write_nav2, write_octoma
 from bmask_slam.run_folder.landmark_file import DenseCloud
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.semantics.beliefs.surface_geometry import FLOORS
-from bmask_slam.world.keyframe import Keyframe
 
 logger = logging.getLogger(__name__)
 
@@ -149,7 +148,7 @@ def map_frame(saved: SavedMap, cloud: DenseCloud) -> tuple[Array, str]:
     points, normals, gravity = cloud.points_world, cloud.normals_world, saved.up_world
     if not len(points):
         raise InputError(f"{saved.path}: its dense cloud is empty")
-    guess = _cameras_up(saved.keyframes) if gravity is None else gravity
+    guess = saved.up_guess()
     limits_deg = (LABELLED_DEG, GUESS_DEG) if gravity is None else (GRAVITY_DEG, GRAVITY_DEG)
     facing = UPRIGHT_COSINE if gravity is None else np.cos(np.deg2rad(2 * GRAVITY_DEG))
     labelled = np.isin(cloud.labels, FLOORS)
@@ -168,10 +167,3 @@ def map_frame(saved: SavedMap, cloud: DenseCloud) -> tuple[Array, str]:
     text = f"up by {guessed if gravity is None else 'gravity, which was measured'}, the floor by "
     text += "its labels" if by_labels else "the lowest level"
     return make_pose(axes_along_walls(up, normals), np.array([0.0, 0.0, -floor_m])), text
-
-
-def _cameras_up(keyframes: list[Keyframe]) -> Array:
-    """The mean upward axis (3,) of the images, a unit vector, of keyframes with a pose."""
-    poses = np.array([k.T_world_camera for k in keyframes])
-    up = -np.mean(poses[np.isfinite(poses).all(axis=(1, 2)), :3, 1], axis=0)
-    return np.asarray(up / np.linalg.norm(up), float)

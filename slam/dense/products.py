@@ -99,8 +99,7 @@ def write_products(
     if not len(surface.vertices):
         raise InputError(f"{fused.run.path}: no surface: too few keyframes have depth")
     views = evidence.views(surface.vertices)
-    up_guess = -np.mean([k.T_world_camera[:3, 1] for k in evidence.keyframes], axis=0)
-    table = evidence.table(evidence.ground(surface, views, up_guess))
+    table = evidence.table(evidence.ground(surface, views))
     cloud = _labelled(surface, views, table, grown.alike)
     kept = ~np.isin(cloud.labels, [fused.labels.number(n) for n in fused.options.excluded or ()])
     surface, cloud = surface.select(kept), cloud.select(kept)
@@ -109,10 +108,10 @@ def write_products(
     names, folder = table.stuff_fusion.names, fused.folder
     written, changed = _write_clouds(fused, cloud, names)
     if fused.options.mesh:
-        written += _write_mesh(fused, cloud, surface.triangles, up_guess)
+        written += _write_mesh(fused, cloud, surface.triangles)
     if fused.options.plan:
         points, normals = (a.astype(float) for a in (cloud.points, cloud.normals))
-        plan = FloorPlan(plan_frame(points, normals, up_guess, PLAN_CELL_M), names)
+        plan = FloorPlan(plan_frame(points, normals, fused.run.up_guess(), PLAN_CELL_M), names)
         plan.add(cloud)
         path_world = np.stack([k.T_world_camera[:3, 3] for k in evidence.keyframes])
         written.append(write_picture(folder.path / "plan.png", plan.picture(path_world)))
@@ -150,7 +149,7 @@ class KeyframeEvidence:
             pairs.append(rows_seen(points_world, view, camera))
         return views_of(pairs, len(points_world), int(self.first[-1]))
 
-    def ground(self, surface: Surface, views: csr_matrix, up_guess: Array) -> Ground | None:
+    def ground(self, surface: Surface, views: csr_matrix) -> Ground | None:
         """Up and the floor, from some points of the surface that look like floor in a keyframe."""
         best = [(e, [e.stuff_names[row.argmax()] for row in e.stuff]) for e in self._all]
         parts = [np.r_[np.zeros(len(e.log_likelihoods)), np.isin(n, FLOORS)] for e, n in best]
@@ -158,7 +157,7 @@ class KeyframeEvidence:
         some = slice(None, None, SAMPLE_STEP)
         points = surface.vertices[some].astype(float)
         cameras = np.stack([k.T_world_camera[:3, 3] for k in self.keyframes])
-        up_world = up_direction(surface.normals[some].astype(float), up_guess)
+        up_world = up_direction(surface.normals[some].astype(float), self._fused.run.up_guess())
         return find_ground(points[is_floor[some]], cameras, up_world)
 
     def table(self, ground: Ground | None) -> LabelTable:
@@ -256,9 +255,9 @@ def _regions(fused: FusedMap) -> list[ObjectRegion]:
     ]
 
 
-def _write_mesh(fused: FusedMap, cloud: Cloud, triangles: Ints, up_guess: Array) -> list[Path]:
+def _write_mesh(fused: FusedMap, cloud: Cloud, triangles: Ints) -> list[Path]:
     """Write the mesh, for viewers too, and a picture of it in its colours, lit from the camera."""
-    up_world = up_direction(cloud.normals[::SAMPLE_STEP].astype(float), up_guess)
+    up_world = up_direction(cloud.normals[::SAMPLE_STEP].astype(float), fused.run.up_guess())
     path, T_world_camera = fused.folder.path, _middle(fused.keyframes())
     point_m = 1.6 * fused.options.surface_voxel_m  # no gaps in what is seen aslant
     seen = nearest_points(cloud.points, fused.run.camera, T_world_camera, point_m)

@@ -50,6 +50,14 @@ class SavedMap:
         """The current T_world_camera (4, 4) of every keyframe by its id."""
         return {k.id: k.T_world_camera for k in self.world.keyframes.values()}
 
+    def up_guess(self) -> Array:
+        """About up (3,), a unit vector: by gravity, or the mean upward axis of the images."""
+        if self.up_world is not None:
+            return self.up_world
+        poses = np.array([k.T_world_camera for k in self.keyframes])
+        up = -np.mean(poses[np.isfinite(poses).all(axis=(1, 2)), :3, 1], axis=0)
+        return np.asarray(up / np.linalg.norm(up), float)
+
     def label_distributions(self, ids: Ints, names: LabelSet) -> tuple[Array, Mask]:
         """Distributions (N, C) over ``names`` of landmarks (N,), and which (N,) are known.
 

@@ -134,6 +134,16 @@ def test_a_labelled_floor_is_level_to_a_camera_that_looks_down() -> None:
     assert found_frame(unlabelled, 70.0, None)[0][2, 2] < 0.9  # nothing says where up is
 
 
+def test_a_first_guess_of_up_is_gravity_or_the_mean_of_the_cameras() -> None:
+    tilted, lost = camera_pose(90.0), np.full((4, 4), np.nan)
+    keyframes: Any = [SimpleNamespace(T_world_camera=T) for T in (np.eye(4), lost, tilted)]
+    saved = SavedMap(Path("run"), WorldMap(), keyframes, CAMERA)
+    mean = np.array([0.0, -1.0, 0.0]) - tilted[:3, 1]
+    assert saved.up_guess() == pytest.approx(mean / np.linalg.norm(mean))
+    measured = replace(saved, up_world=np.array([1.0, 0.0, 0.0]))
+    assert measured.up_guess() == pytest.approx([1.0, 0.0, 0.0])
+
+
 def test_gravity_says_where_up_is() -> None:
     """Its error, here 3 degrees of a mounting, is mended by the plane of the floor."""
     gravity = so3_exp(np.deg2rad([2.0, -2.0, 0.0]))[:, 2]
