@@ -43,9 +43,17 @@ def marginals_of(
     values: gtsam.Values,
     keyframe_ids: Ints,
     landmark_ids: Ints,
+    order: gtsam.Ordering | None = None,
 ) -> Marginals:
-    """The covariances of some variables. Raises RuntimeError where the graph is singular."""
-    source = gtsam.Marginals(graph, values)
+    """The covariances of some variables; ``order``: of elimination, None for GTSAM's own.
+
+    Raises RuntimeError where the graph is singular.
+    """
+    source: gtsam.Marginals | gtsam.GaussianBayesTree = (
+        gtsam.Marginals(graph, values)
+        if order is None
+        else graph.linearize(values).eliminateMultifrontal(order)
+    )
     poses = [source.marginalCovariance(key) for key in keyframe_keys(keyframe_ids)]
     points = [source.marginalCovariance(key) for key in landmark_keys(landmark_ids)]
     return Marginals(

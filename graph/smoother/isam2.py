@@ -13,13 +13,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import NO_SLOT, FactorTables
 from bmask_slam.graph.factors.graph_update import GraphUpdate
 from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
-from bmask_slam.graph.factors.keys import (
-    LANDMARK_BASE,
-    VELOCITY_BASE,
-    keyframe_keys,
-    landmark_keys,
-    variable_named_in,
-)
+from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys, variable_named_in
 from bmask_slam.graph.factors.own_factors import (
     Variable,
     exchange_own_factors,
@@ -36,6 +30,7 @@ from bmask_slam.graph.inertial.preintegration import (
 )
 from bmask_slam.graph.inertial.tables import InertialChange
 from bmask_slam.graph.marginals.covariances import Marginals, marginals_of
+from bmask_slam.graph.smoother.elimination import RootPoints, add_root
 
 
 class SolverError(Exception):
@@ -93,6 +88,7 @@ class Solver:
         self._config = config
         self._maker = FactorMaker(camera, config)
         self._isam: gtsam.ISAM2 | None = None
+        self._root = RootPoints()
         self.elapsed_s = 0.0
         """Time spent in GTSAM's update and read-back since this was last set to zero."""
 
@@ -115,7 +111,7 @@ class Solver:
         self._isam = None
         if not len(tables.keyframes.ids):
             return
-        self._isam = gtsam.ISAM2(_parameters(self._config))
+        self._isam, self._root = gtsam.ISAM2(_parameters(self._config)), RootPoints()
         own = sorted(tables.own_factors.items())
         for _, one in own:
             one.slot = NO_SLOT
@@ -143,6 +139,8 @@ class Solver:
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(max_iterations)
         parameters.setRelativeErrorTol(self._config.least_decrease)
+        if (order := add_root(graph, values, tables.keyframes)) is not None:
+            parameters.setOrdering(order)
         started_s = time.perf_counter()
         try:
             before = graph.error(values)
@@ -180,7 +178,9 @@ class Solver:
         if not len(tables.keyframes.ids):
             return Marginals(tables.keyframes.ids, np.zeros((0, 6, 6)))
         try:
-            return marginals_of(*self._everything(tables), tables.keyframes.ids, landmarks)
+            graph, values = self._everything(tables)
+            order = add_root(graph, values, tables.keyframes)
+            return marginals_of(graph, values, tables.keyframes.ids, landmarks, order)
         except RuntimeError as error:
             raise SolverError(str(error).strip(), variable_named_in(str(error))) from error
 
@@ -206,7 +206,9 @@ class Solver:
         own = [tables.own_factors[number] for number in change.own]
         factors = self._factors(tables, change.rows, change.numbers)
         inertial = inertial_factors(tables.inertial, change.inertial.names)
-        graph = make_graph([*factors, *(one.factor for one in own), *inertial])
+        root = self._root.follow(tables.keyframes, change.keyframe_ids)
+        graph = make_graph([*factors, *(one.factor for one in own), *root.factors, *inertial])
+        change = replace(change, removed_slots=[*change.removed_slots, *root.removed_slots])
         values = make_values(
             change.keyframe_ids,
             tables.keyframes.get(change.keyframe_ids),
@@ -214,10 +216,13 @@ class Solver:
             tables.landmarks.get(change.landmark_ids),
         )
         insert_states(values, tables.inertial, change.inertial)
+        for key, point_world in root.points_world.items():
+            values.insert(key, point_world)
         slots, estimate = self._run(graph, values, change)
         poses, points = read_values(estimate)
         count = len(tables.landmarks.ids)
-        expected = len(tables.keyframes.ids), count + len(tables.inertial.states)
+        others = len(tables.inertial.states) + len(self._root.keys)
+        expected = len(tables.keyframes.ids), count + others
         if (len(poses), len(points)) != expected:
             self._isam = None
             raise SolverError("ISAM2 and the factor tables have different variables", None)
@@ -229,6 +234,7 @@ class Solver:
             tables.pose_factors[number].slot = next(later)
         for one in own:
             one.slot = next(later)
+        self._root.slots += [next(later) for _ in root.factors]
         tables.inertial.slots |= dict(zip(change.inertial.names, later, strict=True))
         self._check_inertial(read_states(estimate, tables.inertial))
         tables.keyframes.values, tables.landmarks.values = poses, points
@@ -243,18 +249,24 @@ class Solver:
             if any(self._isam.valueExists(key) for key in keys):
                 self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), removed)
                 removed = []  # an id that was removed is used again: remove it first
-            result = self._isam.update(graph, values, removed, poses_last(graph))
+            result = self._isam.update(graph, values, removed, self._root.order(graph))
             slots = result.getNewFactorsIndices()
             for _ in range(self._config.extra_iterations):
-                self._isam.update()
+                self._iterate(self._isam)
             for _ in range(change.max_iterations):
-                if self._isam.update().getVariablesRelinearized() == 0:
+                if self._iterate(self._isam).getVariablesRelinearized() == 0:
                     break
             return slots, self._isam.calculateEstimate()
         except Exception as error:  # a user's factor may raise any
             raise self._failure(error) from error
         finally:
             self.elapsed_s += time.perf_counter() - started_s
+
+    def _iterate(self, isam: gtsam.ISAM2) -> gtsam.ISAM2Result:
+        if not self._root.keys:
+            return isam.update()
+        nothing = gtsam.NonlinearFactorGraph()
+        return isam.update(nothing, gtsam.Values(), [], self._root.order(nothing))
 
     def _failure(self, error: Exception) -> SolverError:
         self._isam = None
@@ -274,20 +286,6 @@ class Solver:
             if bad.any():
                 self._isam = None
                 raise SolverError("a value is not finite", (name, int(ids[bad][0])))
-
-
-def poses_last(graph: gtsam.NonlinearFactorGraph) -> gtsam.KeyGroupMap:
-    """The elimination order constraint for ISAM2: poses (and inertial states) come last.
-
-    By default all variables of a change come last, and a removed keyframe concerns hundreds of
-    landmarks. A pose that is eliminated before them connects all that it observes to each other,
-    which takes four times the time and the memory where a place is visited again.
-    """
-    groups = gtsam.KeyGroupMap()
-    for key in graph.keyVector():
-        if key >= VELOCITY_BASE or key < LANDMARK_BASE:
-            groups.insert2(key, 1)
-    return groups
 
 
 def _parameters(config: SmootherConfig) -> gtsam.ISAM2Params:

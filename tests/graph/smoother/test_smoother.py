@@ -13,7 +13,7 @@ from bmask_slam.graph.factors.graph_estimate import GraphEstimate, RefusalReason
 from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
-from bmask_slam.graph.smoother.isam2 import poses_last
+from bmask_slam.graph.smoother.elimination import poses_last
 from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
 
 T_NEW_OLD = se3_exp(np.array([0.4, -1.1, 0.7, 3.0, -5.0, 2.0]))
