@@ -187,15 +187,18 @@ class RerunTransport:
     def close(self) -> None:
         """Write buffered data and end the recording.
 
-        A viewer that does not take the data within FLUSH_S loses the rest of it.
+        A viewer that does not take the data within FLUSH_S loses the rest of it, and one that is
+        served ends with it.
         """
+        if self._viewer is not None:  # first: the stream would wait for one that takes nothing
+            self._viewer.close()
+            self._stream.disconnect()
+            return
         try:
             self._stream.flush(timeout_sec=FLUSH_S)
         except RuntimeError as error:
             logger.warning("the viewer did not take all data: %s", error)
         self._stream.disconnect()
-        if self._viewer is not None:
-            self._viewer.close()
 
     def _jpeg(self, jpeg: bytes) -> Any:
         return self._rr.EncodedImage(contents=jpeg, media_type="image/jpeg")

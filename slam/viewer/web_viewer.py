@@ -20,7 +20,7 @@ from bmask_slam.viewer.options import LOCAL
 
 logger = logging.getLogger(__name__)
 
-START_S = 20.0
+START_S, END_S = 20.0, 5.0
 _START = (
     "import ctypes, os, sys; sys.platform == 'linux' and ctypes.CDLL(None).prctl(1, 15); "
     "os.execv(sys.argv[1], sys.argv[1:])"
@@ -61,7 +61,11 @@ class WebViewer:
     def close(self) -> None:
         """End the process."""
         self._process.terminate()
-        self._process.wait()
+        try:
+            self._process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
 
     def _wait_until_it_listens(self, host: str, ports: tuple[int, ...]) -> None:
         end_s = time.monotonic() + START_S

@@ -24,7 +24,7 @@ from bmask_slam.live.processes.worker import (
 
 logger = logging.getLogger(__name__)
 
-LEAST_SHARE, SLOWEST = 0.01, 10.0
+LEAST_SHARE, SLOWEST = 0.002, 30.0
 """A process that works gets at least this share of a processor on a busy machine, where it may
 take so many times as long."""
 
@@ -36,7 +36,7 @@ class RestartPolicy:
     Attributes:
         start_s: longest time of its start; a busy machine needs minutes to load a network.
         answer_s: longest time without a message while it works, if it takes so much of the
-            processor's time or none; one that a busy machine lets run slowly has ten times that.
+            processor's time or none; SLOWEST times that for one that a busy machine lets run.
         restarts: largest number of restarts.
     """
 

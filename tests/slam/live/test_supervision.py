@@ -35,8 +35,10 @@ class FakeWorker(SimpleNamespace):
         (25, 24.0, True),  # an endless loop
         (25, 3.0, False),  # it works, but beside many others
         (190, 15.0, False),
-        (190, 1.0, True),
-        (210, 15.0, True),
+        (190, 1.0, False),  # beside ten others, of which all come first
+        (190, 0.3, True),
+        (590, 15.0, False),
+        (610, 15.0, True),
     ],
 )
 def test_silence_counts_by_the_processor_time_that_was_used(

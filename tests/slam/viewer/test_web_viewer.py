@@ -13,11 +13,15 @@ from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
 
+import numpy as np
 import pytest
 
 from bmask_slam.cli import main
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.play import play
+from bmask_slam.viewer import web_viewer
+from bmask_slam.viewer.options import ViewOptions
+from bmask_slam.viewer.rerun_transport import RerunTransport
 from bmask_slam.viewer.web_viewer import WebViewer
 
 rerun_cli = pytest.importorskip("rerun_cli")
@@ -50,6 +54,21 @@ def test_it_listens_on_this_machine_only_and_ends() -> None:
     assert [listening(port) for port in ports] == [["0100007F"]] * 2
     viewer.close()
     assert [listening(port) for port in ports] == [[]] * 2
+
+
+def test_what_is_shown_ends_though_the_server_takes_nothing(monkeypatch) -> None:
+    """As on a busy machine: the stream would wait for it, and SIGTERM does not reach it."""
+    monkeypatch.setattr(web_viewer, "END_S", 0.5)
+    transport = RerunTransport("run", ViewOptions(serve=free_port()))
+    viewer = transport._viewer
+    assert viewer is not None
+    process = viewer._process
+    process.send_signal(signal.SIGSTOP)
+    points = np.zeros((100_000, 3))
+    for _ in range(50):  # more than the system's buffers hold
+        transport._log("world/points", transport._rr.Points3D(points))
+    transport.close()
+    assert process.returncode == -signal.SIGKILL
 
 
 def test_another_address_is_warned_about(caplog: pytest.LogCaptureFixture) -> None:
