@@ -14,7 +14,7 @@ _INDEX_BITS = 56
 KEYFRAME_BASE = ord("x") << _INDEX_BITS
 LANDMARK_BASE = ord("l") << _INDEX_BITS
 ROOT_BASE = ord("r") << _INDEX_BITS
-"""Of the point at the root of a long map's tree; between landmarks and velocities."""
+"""Of the points at the root of a long map's tree; between landmarks and velocities."""
 VELOCITY_BASE = ord("v") << _INDEX_BITS
 _NAMED = re.compile(r"(?:Symbol: |key \")([xl])(\d+)")
 _NAMES = {"x": "keyframe", "l": "landmark"}

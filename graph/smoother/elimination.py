@@ -69,6 +69,11 @@ class RootChange:
     points_world: dict[int, Array] = field(default_factory=dict)
     removed_slots: list[int] = field(default_factory=list)
 
+    def insert_points(self, values: gtsam.Values) -> None:
+        """Add the points to values."""
+        for key, point_world in self.points_world.items():
+            values.insert(key, point_world)
+
 
 class RootPoints:
     """The points after the newest keyframe of an ISAM2, once that has many."""
@@ -106,11 +111,12 @@ class RootPoints:
         ]
         return RootChange(factors, dict.fromkeys(self.keys, point_world), removed)
 
-    def order(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.KeyGroupMap:
-        """The constraint on the order for an update by a graph: poses, the newest, its points."""
+    @property
+    def last(self) -> tuple[list[int], ...]:
+        """Groups of keys that are eliminated after all others: the newest pose, then its points."""
         if self._keyframe is None:
-            return poses_last(graph)
-        return poses_last(graph, ([key_of_keyframe(self._keyframe)], self.keys))
+            return ()
+        return [key_of_keyframe(self._keyframe)], self.keys
 
 
 def add_root(
@@ -126,7 +132,6 @@ def add_root(
         return None
     for factor in change.factors:
         graph.add(factor)
-    for key, point_world in change.points_world.items():
-        values.insert(key, point_world)
-    last = [key_of_keyframe(int(keyframes.ids.max())), *root.keys]
+    change.insert_points(values)
+    last = [key for group in root.last for key in group]
     return gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, last, True)

@@ -30,7 +30,7 @@ from bmask_slam.graph.inertial.preintegration import (
 )
 from bmask_slam.graph.inertial.tables import InertialChange
 from bmask_slam.graph.marginals.covariances import Marginals, marginals_of
-from bmask_slam.graph.smoother.elimination import RootPoints, add_root
+from bmask_slam.graph.smoother.elimination import RootPoints, add_root, poses_last
 
 
 class SolverError(Exception):
@@ -216,8 +216,7 @@ class Solver:
             tables.landmarks.get(change.landmark_ids),
         )
         insert_states(values, tables.inertial, change.inertial)
-        for key, point_world in root.points_world.items():
-            values.insert(key, point_world)
+        root.insert_points(values)
         slots, estimate = self._run(graph, values, change)
         poses, points = read_values(estimate)
         count = len(tables.landmarks.ids)
@@ -249,7 +248,7 @@ class Solver:
             if any(self._isam.valueExists(key) for key in keys):
                 self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), removed)
                 removed = []  # an id that was removed is used again: remove it first
-            result = self._isam.update(graph, values, removed, self._root.order(graph))
+            result = self._isam.update(graph, values, removed, poses_last(graph, self._root.last))
             slots = result.getNewFactorsIndices()
             for _ in range(self._config.extra_iterations):
                 self._iterate(self._isam)
@@ -263,10 +262,11 @@ class Solver:
             self.elapsed_s += time.perf_counter() - started_s
 
     def _iterate(self, isam: gtsam.ISAM2) -> gtsam.ISAM2Result:
+        """A further step without new factors, in which root points stay the last."""
         if not self._root.keys:
             return isam.update()
         nothing = gtsam.NonlinearFactorGraph()
-        return isam.update(nothing, gtsam.Values(), [], self._root.order(nothing))
+        return isam.update(nothing, gtsam.Values(), [], poses_last(nothing, self._root.last))
 
     def _failure(self, error: Exception) -> SolverError:
         self._isam = None

@@ -192,13 +192,15 @@ class RerunTransport:
         """
         if self._viewer is not None:  # first: the stream would wait for one that takes nothing
             self._viewer.close()
-            self._stream.disconnect()
-            return
+        else:
+            self._flush()
+        self._stream.disconnect()
+
+    def _flush(self) -> None:
         try:
             self._stream.flush(timeout_sec=FLUSH_S)
         except RuntimeError as error:
             logger.warning("the viewer did not take all data: %s", error)
-        self._stream.disconnect()
 
     def _jpeg(self, jpeg: bytes) -> Any:
         return self._rr.EncodedImage(contents=jpeg, media_type="image/jpeg")
