@@ -7,6 +7,7 @@ import gc
 import hashlib
 import os
 import shutil
+import signal
 import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -26,8 +27,11 @@ def pytest_configure() -> None:
     """One thread a process, and no segmenter in runs where a test does not ask for one.
 
     The workers of pytest-xdist share the cores. A network in each run would take minutes; what a
-    user gets is tested in processes of their own.
+    user gets is tested in processes of their own. Ctrl-C ends what tests start, also where a shell
+    has started pytest in the background and so made all processes ignore it.
     """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     for variable in ONE_THREAD:  # read when numpy, OpenCV and torch are loaded
         os.environ.setdefault(variable, "1")
     from bmask_slam.labelling import config
