@@ -40,8 +40,7 @@ class SlamSystem(SensorSystem):
 
     Attributes:
         camera, config: as given.
-        map: the owner of map and graph.
-        events: what happened; all parts report to it.
+        map: the owner of map and graph. events: what happened; all parts report to it.
         camera_tracker: tracks frames against the map.
         moving_objects: keeps what moves out of tracking and out of the map.
         keyframes: decides which frames stay in the map.
@@ -250,6 +249,7 @@ class SlamSystem(SensorSystem):
 
     @stage("graph")
     def _optimise(self, keyframe: Keyframe) -> None:
+        self.moving_objects.remove_moving()
         self.map.optimise(keyframe)
 
     @stage("loops")

@@ -11,7 +11,8 @@ class SmootherConfig:
     """Settings of `graph.smoother.smoother.Smoother`.
 
     Attributes:
-        relinearize_threshold: change of a variable (rad, m) above which ISAM2 linearises anew.
+        relinearize_threshold: change of a variable (rad, m) above which ISAM2 linearises anew. At
+            0.01 what is neglected is some hundredths of a pixel.
         relinearize_skip: ISAM2 looks for such variables every so many updates.
         extra_iterations: further ISAM2 updates without new factors after each update.
         robust: Huber's kernel on observations; without, factors are plain Gaussian.
@@ -43,7 +44,7 @@ class SmootherConfig:
         max_repairs: attempts to rebuild after failures before the update is given up.
     """
 
-    relinearize_threshold: float = 0.003
+    relinearize_threshold: float = 0.01
     relinearize_skip: int = 1
     extra_iterations: int = 0
     robust: bool = True

@@ -69,6 +69,11 @@ class FactorSelector:
         """Remove the factors of a culled keyframe with the next update."""
         self._removed_keyframes.append(keyframe_id)
 
+    @property
+    def has_removals(self) -> bool:
+        """Whether the next update will remove factors."""
+        return bool(self._removed_keyframes) or any(map(len, self._removed))
+
     def state(self) -> Arrays:
         """Removals that the next update will carry out."""
         return {

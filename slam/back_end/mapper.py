@@ -57,8 +57,7 @@ class Mapper:
     Attributes:
         world: keyframes and landmarks. history: of all tracked frames. smoother: the graph.
         loops: finds loops, and holds closed ones. events: of this system.
-        sensors: makes factors of the measurements of other sensors.
-        update_ms: wall time of every graph update.
+        sensors: makes factors of other sensors. update_ms: wall time of every graph update.
     """
 
     def __init__(self, camera: Camera, tracker: Tracker, config: BackEndConfig):
@@ -201,10 +200,11 @@ class Mapper:
         logger.info("mask of keyframe %d: %s", keyframe_id, report)
 
     def prune_landmarks(self, landmark_ids: Ints) -> None:
-        """Remove landmarks (N,) from map and graph, with all their observations."""
-        report = self.pruner().prune_landmarks(landmark_ids)
-        self.events.count(report.counts("moving"))
-        logger.info("landmarks that move: %s", report)
+        """Remove landmarks (N,) from the map, and from the graph with its next update."""
+        ids = self.pruner().prune_landmarks(landmark_ids)
+        self._factor_selector.remove_landmarks(ids)
+        self.events.count({"landmarks pruned: moving": len(ids)})
+        logger.info("landmarks that move: %d removed", len(ids))
 
     def restore_observations(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
         """Keypoints (N,) of a keyframe that were masked observe landmarks again.
@@ -238,9 +238,9 @@ class Mapper:
         self._apply(self.smoother.update(update), timed=False)
 
     def add_waiting_measurements(self, last: bool = False) -> None:
-        """Make factors of what waited for the next keyframe; ``last``: there will be none."""
+        """Carry out what waited for the next keyframe; ``last``: there will be none."""
         changes = self.sensors.changes(self, last)
-        if changes:
+        if changes or (last and self._factor_selector.has_removals):
             update = changes.added_to(self._factor_selector.map_update(self.world))
             self._apply(self.smoother.update(update), timed=False)
 

@@ -107,15 +107,18 @@ class MapPruner:
         keypoints = keypoints_under(mask, keyframe.features.image_pixels, self.border_px)
         return self._prune_observations(keyframe, keypoints)
 
-    def prune_landmarks(self, ids: Ints) -> PruneReport:
-        """Remove landmarks (N,), or those into which they were fused.
+    def prune_landmarks(self, ids: Ints) -> Ints:
+        """Remove landmarks (N,), or those into which they were fused, from the map.
 
-        Ids that are not in the map are skipped.
+        Ids that are not in the map are skipped. Returns the ids (M,) of those that were removed; an
+        update of the graph for them alone would take as long as that for a keyframe.
         """
         landmarks = self.world.landmarks
         known = ids[(ids >= 0) & (ids < len(landmarks))]
         current = np.unique(landmarks.current(known))
-        return self._remove(current[landmarks.in_map[current]], np.zeros((0, 2), np.int64))
+        removed = current[landmarks.in_map[current]]
+        self.world.mask_landmarks(removed)
+        return removed
 
     def prune_loop(self, keyframe_a: int, keyframe_b: int) -> PruneReport:
         """Remove a loop: its relative poses, and the fusions of landmarks that it caused.

@@ -131,13 +131,17 @@ class MovingObjectFilter:
             self._camera_tracker.refer_to(reference)
         return restored
 
+    def remove_moving(self) -> None:
+        """Take the landmarks that move out of the map, before the graph gets a new keyframe."""
+        self.landmarks.follow_map()
+        self.landmarks.remove_moving(self.landmarks.movability.known())
+
     def store_keyframe(self, keyframe: Keyframe, static: StaticFeatures) -> None:
-        """A keyframe was made: remove landmarks that move, and keep the keyframe's depth.
+        """A keyframe was made: keep its depth.
 
         Depth on moving things is not kept: the same thing would be judged by it later.
         """
         self.landmarks.follow_map()
-        self.landmarks.remove_moving(self.landmarks.movability.known())
         if static.view is not None:
             self.keyframe_views.add(keyframe.id, keyframe.timestamp_s, static.view, static.space)
 

@@ -75,6 +75,14 @@ class Session:
     def pruner(self) -> MapPruner:
         return MapPruner(self.world, self.smoother, CAMERA, border_px=-3)
 
+    def prune_landmarks(self, ids: Array) -> Array:
+        """Remove landmarks from the map, and from the graph by an update; returns the ids."""
+        removed = self.pruner().prune_landmarks(ids)
+        self.factor_selection.remove_landmarks(removed)
+        update = self.factor_selection.map_update(self.world)
+        read_back(self.world, self.smoother.update(update))
+        return removed
+
     def fuse(self) -> None:
         """Fuse the landmarks of each point into its oldest."""
         point = np.full(len(self.world.landmarks), -1, np.int64)
@@ -180,15 +188,13 @@ def test_observations_are_removed_and_landmarks_kept() -> None:
 def test_landmarks_are_removed_with_all_their_observations() -> None:
     session = Session(4)
     requested = np.array([5, 17])
-    removed = session.pruner().prune_landmarks(np.array([17, 5, -1, 10**6])).landmark_ids
+    removed = session.prune_landmarks(np.array([17, 5, -1, 10**6]))
     assert removed.tolist() == requested.tolist()
     assert not session.world.landmarks.in_map[removed].any()
     assert all(k.masked[removed].all() for k in session.world.keyframes.values())
     assert not {i for _, i in in_graph(session.smoother)} & set(removed.tolist())
     assert_consistent(session.world, session.smoother)
-    again = session.pruner().prune_landmarks(removed)
-    assert len(again.landmark_ids) == 0
-    assert str(again) == "nothing removed"
+    assert not len(session.pruner().prune_landmarks(removed))
 
 
 def test_a_landmark_with_one_observation_is_removed_with_it() -> None:
@@ -216,8 +222,8 @@ def test_a_late_mask_applies_after_fusing_and_culling() -> None:
     assert {(first.id, 3), (first.id, 8)} <= set(map(tuple, report.observations.tolist()))
     assert culled not in {*report.landmark_ids.tolist(), *report.observations[:, 1].tolist()}
     assert_consistent(session.world, session.smoother)
-    by_old_id = session.pruner().prune_landmarks(old)
-    assert by_old_id.landmark_ids.tolist() == [3, 8]  # what they were fused into
+    by_old_id = session.prune_landmarks(old)
+    assert by_old_id.tolist() == [3, 8]  # what they were fused into
 
 
 def test_a_late_mask_of_a_culled_keyframe_finds_nothing_to_remove() -> None:
@@ -299,10 +305,11 @@ def test_map_and_graph_agree_in_any_order_of_events(
             session.add_keyframe(np.arange(COUNT))  # what is pending goes first
             report = session.pruner().prune_mask(keyframe_id, mask)
             assert not report.refused
+            removed_ids = report.landmark_ids
             if entirely:
                 ids = np.flatnonzero(rng.random(len(world.landmarks)) < 0.05)
-                report = session.pruner().prune_landmarks(ids)
-            assert not world.landmarks.in_map[report.landmark_ids].any()
+                removed_ids = session.prune_landmarks(ids)
+            assert not world.landmarks.in_map[removed_ids].any()
             assert_consistent(world, session.smoother)
     session.add_keyframe(np.arange(COUNT))
     assert_consistent(world, session.smoother)
@@ -334,7 +341,10 @@ def test_masked_keypoints_stay_out_of_the_running_system() -> None:
         assert (keyframe.landmark_ids[under] == -1).all()
     assert not pruned & in_graph(system.mapper.smoother)
     assert in_graph(system.mapper.smoother) <= in_map(world)
+    moving = np.flatnonzero(world.landmarks.in_graph)[:20]
+    system.mapper.prune_landmarks(moving)  # after the last keyframe: no update follows
     system.finish()
+    assert not np.isin(moving, system.mapper.smoother.estimate().landmark_ids).any()
     ends = system.trajectory().positions_world[[0, -1]]
     truth = np.array([poses[0][:3, 3], poses[-1][:3, 3]])
     assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(

@@ -51,7 +51,7 @@ def followed() -> tuple[SlamSystem, WorldMap, FrameHistory, list[int]]:
             observed = system.mapper.world.observed(
                 list(system.mapper.world.keyframes.values())[-1]
             )
-            system.mapper.pruner().prune_landmarks(observed[1][:20])
+            system.mapper.prune_landmarks(observed[1][:20])
         sent = pickle.dumps(maker.delta(system.mapper.world, system.mapper.history))
         sizes.append(len(sent))
         apply_delta(pickle.loads(sent), copy, history)
