@@ -15,6 +15,7 @@ from bmask_slam.graph.errors import MAX_NUMBER
 UNDISTORTION_STEPS = 5
 NO_DEPTH_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 MAX_SIDE_PX = 65_535
+LEAST = 1e-9  # smaller focal lengths, scales and rates overflow where they are divided by
 KINECT_DISPARITY_SIGMA_PX = 0.08
 
 
@@ -100,8 +101,10 @@ class Camera:
             return "a number that is not finite"
         if not (1 <= self.width <= MAX_SIDE_PX and 1 <= self.height <= MAX_SIDE_PX):
             return f"an image of {self.width} x {self.height} pixels"
-        if min(self.fx, self.fy, self.depth_scale, self.fps, self.stereo_bf_px_m) <= 0:
-            return "a focal length, depth scale, rate or stereo_bf that is not positive"
+        if min(self.fx, self.fy, self.depth_scale, self.fps, self.stereo_bf_px_m) < LEAST:
+            return (
+                f"a focal length, depth scale, rate or stereo_bf that is not positive ({LEAST:g})"
+            )
         return ""
 
     def noise_of_depth(self, disparity_sigma_px: float | None = None) -> DepthNoise:

@@ -205,7 +205,16 @@ BROKEN = {
 @pytest.mark.parametrize("name", BROKEN)
 def test_broken_files_are_refused_in_one_line(name: str, tmp_path: Path) -> None:
     path = write_small(next(small for small in SMALL_LAYOUTS if small.file == name), tmp_path)
-    file, text, reason = BROKEN[name]
+    check_refused(path, *BROKEN[name])
+
+
+def test_a_focal_length_by_which_nothing_can_be_divided_is_refused(tmp_path: Path) -> None:
+    path = write_small(next(small for small in SMALL_LAYOUTS if small.file == "scene"), tmp_path)
+    tiny = "1e-320 0 15 0 0 15 5.5 0 0 0 1 0 0 0 0 1"
+    check_refused(path, "intrinsic/intrinsic_depth.txt", tiny, "focal length.*not positive")
+
+
+def check_refused(path: Path, file: str, text: str, reason: str) -> None:
     (path / file).write_text(text)
     with pytest.raises(InputError, match=reason) as caught:
         open_sequence(path)
