@@ -102,9 +102,8 @@ class Camera:
         if not (1 <= self.width <= MAX_SIDE_PX and 1 <= self.height <= MAX_SIDE_PX):
             return f"an image of {self.width} x {self.height} pixels"
         if min(self.fx, self.fy, self.depth_scale, self.fps, self.stereo_bf_px_m) < LEAST:
-            return (
-                f"a focal length, depth scale, rate or stereo_bf that is not positive ({LEAST:g})"
-            )
+            what = "a focal length, depth scale, rate or stereo_bf"
+            return f"{what} that is not positive, or below {LEAST:g}"
         return ""
 
     def noise_of_depth(self, disparity_sigma_px: float | None = None) -> DepthNoise:

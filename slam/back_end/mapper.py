@@ -201,10 +201,10 @@ class Mapper:
 
     def prune_landmarks(self, landmark_ids: Ints) -> None:
         """Remove landmarks (N,) from the map, and from the graph with its next update."""
-        ids = self.pruner().prune_landmarks(landmark_ids)
-        self._factor_selector.remove_landmarks(ids)
-        self.events.count({"landmarks pruned: moving": len(ids)})
-        logger.info("landmarks that move: %d removed", len(ids))
+        report = self.pruner().prune_landmarks(landmark_ids)
+        self._factor_selector.remove_landmarks(report.landmark_ids)
+        self.events.count(report.counts("moving"))
+        logger.info("landmarks that move: %s", report)
 
     def restore_observations(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
         """Keypoints (N,) of a keyframe that were masked observe landmarks again.

@@ -3,7 +3,7 @@
 Masks of a keyframe may come seconds after it. By then its landmarks may have been fused into
 others, culled, or marginalised out of the graph, the keyframe may have been culled, its segment
 joined to another, a loop closed. So everything is looked up by the ids as they are now. The graph
-is changed first; the map follows.
+is changed first and the map follows, but for landmarks that move: they leave the map first.
 """
 
 from __future__ import annotations
@@ -107,18 +107,18 @@ class MapPruner:
         keypoints = keypoints_under(mask, keyframe.features.image_pixels, self.border_px)
         return self._prune_observations(keyframe, keypoints)
 
-    def prune_landmarks(self, ids: Ints) -> Ints:
-        """Remove landmarks (N,), or those into which they were fused, from the map.
+    def prune_landmarks(self, ids: Ints) -> PruneReport:
+        """Remove landmarks (N,), or those into which they were fused, from the map alone.
 
-        Ids that are not in the map are skipped. Returns the ids (M,) of those that were removed; an
-        update of the graph for them alone would take as long as that for a keyframe.
+        Ids that are not in the map are skipped. The graph is left to its next update: one for them
+        alone would take as long as that for a keyframe.
         """
         landmarks = self.world.landmarks
         known = ids[(ids >= 0) & (ids < len(landmarks))]
         current = np.unique(landmarks.current(known))
         removed = current[landmarks.in_map[current]]
         self.world.mask_landmarks(removed)
-        return removed
+        return PruneReport(removed)
 
     def prune_loop(self, keyframe_a: int, keyframe_b: int) -> PruneReport:
         """Remove a loop: its relative poses, and the fusions of landmarks that it caused.

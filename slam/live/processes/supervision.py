@@ -36,7 +36,7 @@ class RestartPolicy:
     Attributes:
         start_s: longest time of its start; a busy machine needs minutes to load a network.
         answer_s: longest time without a message while it works, if it takes so much of the
-            processor's time or none; SLOWEST times that for one that a busy machine lets run.
+            processor's time or none; one that a busy machine slows down has SLOWEST times that.
         restarts: largest number of restarts.
     """
 

@@ -18,7 +18,7 @@ from synthetic_view import (
 )
 
 from bmask_slam.back_end.factor_selection import FactorSelectionConfig, FactorSelector, read_back
-from bmask_slam.back_end.pruning import MapPruner
+from bmask_slam.back_end.pruning import MapPruner, PruneReport
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
@@ -75,13 +75,13 @@ class Session:
     def pruner(self) -> MapPruner:
         return MapPruner(self.world, self.smoother, CAMERA, border_px=-3)
 
-    def prune_landmarks(self, ids: Array) -> Array:
-        """Remove landmarks from the map, and from the graph by an update; returns the ids."""
-        removed = self.pruner().prune_landmarks(ids)
-        self.factor_selection.remove_landmarks(removed)
+    def prune_landmarks(self, ids: Array) -> PruneReport:
+        """Remove landmarks from the map, and from the graph by an update."""
+        report = self.pruner().prune_landmarks(ids)
+        self.factor_selection.remove_landmarks(report.landmark_ids)
         update = self.factor_selection.map_update(self.world)
         read_back(self.world, self.smoother.update(update))
-        return removed
+        return report
 
     def fuse(self) -> None:
         """Fuse the landmarks of each point into its oldest."""
@@ -188,13 +188,15 @@ def test_observations_are_removed_and_landmarks_kept() -> None:
 def test_landmarks_are_removed_with_all_their_observations() -> None:
     session = Session(4)
     requested = np.array([5, 17])
-    removed = session.prune_landmarks(np.array([17, 5, -1, 10**6]))
+    removed = session.prune_landmarks(np.array([17, 5, -1, 10**6])).landmark_ids
     assert removed.tolist() == requested.tolist()
     assert not session.world.landmarks.in_map[removed].any()
     assert all(k.masked[removed].all() for k in session.world.keyframes.values())
     assert not {i for _, i in in_graph(session.smoother)} & set(removed.tolist())
     assert_consistent(session.world, session.smoother)
-    assert not len(session.pruner().prune_landmarks(removed))
+    again = session.pruner().prune_landmarks(removed)
+    assert len(again.landmark_ids) == 0
+    assert str(again) == "nothing removed"
 
 
 def test_a_landmark_with_one_observation_is_removed_with_it() -> None:
@@ -223,7 +225,7 @@ def test_a_late_mask_applies_after_fusing_and_culling() -> None:
     assert culled not in {*report.landmark_ids.tolist(), *report.observations[:, 1].tolist()}
     assert_consistent(session.world, session.smoother)
     by_old_id = session.prune_landmarks(old)
-    assert by_old_id.tolist() == [3, 8]  # what they were fused into
+    assert by_old_id.landmark_ids.tolist() == [3, 8]  # what they were fused into
 
 
 def test_a_late_mask_of_a_culled_keyframe_finds_nothing_to_remove() -> None:
@@ -305,11 +307,10 @@ def test_map_and_graph_agree_in_any_order_of_events(
             session.add_keyframe(np.arange(COUNT))  # what is pending goes first
             report = session.pruner().prune_mask(keyframe_id, mask)
             assert not report.refused
-            removed_ids = report.landmark_ids
             if entirely:
                 ids = np.flatnonzero(rng.random(len(world.landmarks)) < 0.05)
-                removed_ids = session.prune_landmarks(ids)
-            assert not world.landmarks.in_map[removed_ids].any()
+                report = session.prune_landmarks(ids)
+            assert not world.landmarks.in_map[report.landmark_ids].any()
             assert_consistent(world, session.smoother)
     session.add_keyframe(np.arange(COUNT))
     assert_consistent(world, session.smoother)
