@@ -173,23 +173,19 @@ def judged(
     config: SelfCalibrationConfig,
     free: tuple[int, ...] = FREE,
 ) -> SelfCalibration:
-    """The state after an estimate.
+    """The state after an estimate. What was adopted is not estimated again.
 
     A parameter that does not show yet is looked for again later, unless one was adopted. Only those
-    of ``free`` may be; with a mode other than "auto" it is only told. Where a readout time was
-    adopted, the map had been made without one, and all is estimated once more from the next.
+    of ``free`` may be; with a mode other than "auto" it is only told.
     """
-    adopted = _adopted(state)
-    sure = [i for i in newly_sure(estimate, set(FREE) - adopted, config) if i in free]
-    if adopted:
-        return _refined(state, estimate, sure, config)
+    sure = [i for i in newly_sure(estimate, FREE, config) if i in free]
     if sure:
         verdict = "found and applied" if mode == "auto" else "found, not applied"
         text = format_found(estimate, sure, verdict)
         if mode != "auto":
             return dataclasses.replace(state, text=text, settled=True)
-        camera = camera_with(state.camera, estimate.found, sure)
-        return dataclasses.replace(state, camera=camera, text=text, settled=SHUTTER not in sure)
+        camera = camera_with(state.given, estimate.found, sure)
+        return dataclasses.replace(state, camera=camera, text=text, settled=True)
     seen = [i for i in free if estimate.shows(i, config)]
     differs = any(estimate.differs(i, config) for i in free)
     verdict = "not sure enough to be applied" if differs else "the camera keeps it"
@@ -200,61 +196,21 @@ def judged(
     return dataclasses.replace(state, text=text, looks=looks, settled=settled)
 
 
-def _adopted(state: SelfCalibration) -> set[int]:
-    """The parameters that were adopted, the distortion of depth as a whole."""
-    cameras = [parameters_of(c, c.depth_scale) for c in (state.given, state.camera)]
-    changed = set(np.flatnonzero(cameras[0] != cameras[1]).tolist())
-    return changed | set(BENDS) if changed & set(BENDS) else changed
-
-
-def _refined(
-    state: SelfCalibration, estimate: Estimate, sure: list[int], config: SelfCalibrationConfig
-) -> SelfCalibration:
-    """The state after the second estimate of what was adopted, and of what is ``sure`` now.
-
-    The first has shown that they are not those of the camera given; this one is from a better map.
-    A camera that hardly changes is kept.
-    """
-    again = [i for i in _adopted(state) if estimate.shows(i, config)]
-    steps = np.abs(estimate.found - estimate.before)
-    if not sure and all(steps[i] < config.limits(i)[1] for i in again):
-        return dataclasses.replace(state, settled=True)
-    chosen = sorted({*sure, *again})
-    camera = camera_with(state.camera, estimate.found, chosen)
-    text = format_found(estimate, chosen, "found and applied")
-    return dataclasses.replace(state, camera=camera, text=text, settled=True)
-
-
 def newly_sure(
     estimate: Estimate, tried: Iterable[int], config: SelfCalibrationConfig
 ) -> list[int]:
-    """Those of the parameters tried that are to be adopted.
-
-    All are judged together. Or else, where a readout time is wanting, the times alone, and the
-    distortion of depth is fitted along: it takes more views to be known, and by half of them may be
-    far off; the next map will show it better.
-    """
-    differing = {i for i in tried if estimate.differs(i, config)}
-    times = differing & set(TIMES) if SHUTTER in differing else set()
-    for judged_together in (set(FREE), times):
-        chosen = differing & judged_together
-        halves = cross_validate(estimate.problem, sorted(judged_together)) if chosen else None
-        if halves is None:
-            break
-        logger.info(
-            "calibration: better on observations kept out of the fit by %.1f standard errors",
-            halves.gain_sigmas,
-        )
-        if halves.gain_sigmas >= config.min_gain_sigmas:
-            return _agreed(estimate, chosen, halves, config)
-    return []
-
-
-def _agreed(
-    estimate: Estimate, differing: set[int], halves: CrossValidation, config: SelfCalibrationConfig
-) -> list[int]:
-    """Those that both halves find; of the distortion of depth all or none."""
-    agreed = {i for i in differing if estimate.agrees(i, halves, config)}
+    """Those of the parameters tried that are to be adopted."""
+    sure = [i for i in tried if estimate.differs(i, config)]
+    halves = cross_validate(estimate.problem, FREE) if sure else None
+    if halves is None:
+        return []
+    logger.info(
+        "calibration: better on observations kept out of the fit by %.1f standard errors",
+        halves.gain_sigmas,
+    )
+    if halves.gain_sigmas < config.min_gain_sigmas:
+        return []
+    agreed = {i for i in sure if estimate.agrees(i, halves, config)}
     if agreed & set(BENDS):  # one surface, of which no part is right alone
         possible = np.abs(estimate.found[BEND]).max() < config.max_bend
         agreed = agreed | set(BENDS) if possible else agreed - set(BENDS)

@@ -6,8 +6,7 @@ the delay and the distortion of the depth images, are estimated from its map
 those of a published calibration are better than what a short stretch shows, and an error of the
 depth scale, which images and depths alone do not show, would be taken for one of theirs. A readout
 time that the camera has is kept. Whether they are adopted is decided in `calibration.adoption`. If
-none is, the run goes on; else it begins anew with the camera that was found: once, or twice where
-a readout time was found, since the first map was bent for want of it.
+none is, the run goes on; else it begins anew, once, with the camera that was found.
 """
 
 from __future__ import annotations
@@ -99,8 +98,7 @@ class SelfCalibrator:
         try:
             stamps_s = {k.id: k.timestamp_s for k in world.keyframes.values()}
             reader = SequenceDepths(stamps_s, sequence)
-            given = self.state.given
-            estimate = estimate_again(world, system.as_run(), reader, given, worth_s)
+            estimate = estimate_again(world, system.as_run(), reader, worth_s)
         except InputError as error:
             logger.info("calibration: %s", error)
             return None

@@ -101,7 +101,7 @@ class CalibrationServer:
         state = replace(self._state, looks=self._state.looks + 1)
         try:
             reader = KeptDepths(kept, run.camera)
-            estimate = estimate_again(world, run, reader, setup.camera, config.min_change_s)
+            estimate = estimate_again(world, run, reader, config.min_change_s)
         except InputError as error:
             logger.info("calibration: %s", error)
             estimate = None

@@ -32,14 +32,7 @@ from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import plot
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.calibration.cross_validation import CrossValidation
-from bmask_slam.graph.calibration.model import (
-    BEND,
-    LENS,
-    PARAMETERS,
-    SHUTTER,
-    TIME,
-    parameters_of,
-)
+from bmask_slam.graph.calibration.model import BEND, LENS, PARAMETERS, SHUTTER, TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.labelling.mask_memory import MaskMemory, RememberingSegmenter
@@ -267,53 +260,6 @@ def test_a_known_readout_is_held_and_an_unknown_lens_estimated_along(
     assert bool(sigmas[SHUTTER] == 0) is held
     assert (sigmas[LENS] > 0).tolist() == [lens, lens, False, False, False]
     assert (sigmas[list(BENDS)] > 0).all() and sigmas[TIME] > 0
-
-
-CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
-
-
-def _estimate(before: Camera, shutter_s: float, time_s: float, bend: float) -> Estimate:
-    """Times sure to 0.5 ms, a distortion of depth in xx sure to 1 mm at 1 m."""
-    found = np.zeros(18)
-    found[[SHUTTER, TIME, BENDS[2]]] = shutter_s, time_s, bend
-    sigmas = np.where(np.isin(np.arange(18), BENDS), 0.001, 0.0005)
-    start = parameters_of(before, before.depth_scale)
-    return Estimate(start, found, sigmas, None)  # type: ignore[arg-type]
-
-
-def test_times_are_adopted_where_the_bend_spoils_the_proof(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """All together fit observations kept out no better, the times alone do."""
-    asked = []
-
-    def proof(_: object, parameters: list[int]) -> CrossValidation:
-        asked.append(parameters)
-        spoiled = bool(set(parameters) & set(BENDS))
-        estimated = np.tile(estimate.found, (2, 1))
-        gains = np.array([-1.0, 1.0]) if spoiled else np.array([1.0, 1.1])
-        return CrossValidation(estimated, np.full((2, 18), 0.001), gains)
-
-    monkeypatch.setattr("bmask_slam.calibration.adoption.cross_validate", proof)
-    estimate = _estimate(CAMERA, 0.026, -0.02, 0.015)
-    state = judged(SelfCalibration(CAMERA, CAMERA), estimate, "auto", SelfCalibrationConfig())
-    times = {"rolling_shutter_s": 0.026, "depth_time_offset_s": -0.02}
-    assert state.camera == replace(CAMERA, **times)
-    assert asked == [sorted(FREE), sorted((SHUTTER, TIME))]
-    assert not state.settled  # the next map may show the bend
-
-
-def test_what_was_adopted_is_refined_once() -> None:
-    """From a map with the first readout time; a bend that was adopted goes along."""
-    first = replace(CAMERA, rolling_shutter_s=0.022, depth_distortion=(0.0, 0.0, 0.04, 0.0, 0.0))
-    state, config = SelfCalibration(CAMERA, first, "first"), SelfCalibrationConfig()
-    better = judged(state, _estimate(first, 0.026, 0.0, 0.02), "auto", config)
-    assert better.settled and better.text.startswith("rolling shutter 26.0 ± 1.0 ms, depth bent")
-    assert better.camera == replace(
-        CAMERA, rolling_shutter_s=0.026, depth_distortion=(0.0, 0.0, 0.02, 0.0, 0.0)
-    )
-    same = judged(state, _estimate(first, 0.0235, 0.0, 0.041), "auto", config)
-    assert same == replace(state, settled=True)
 
 
 def test_a_camera_takes_over_the_whole_bend() -> None:
