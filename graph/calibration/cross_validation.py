@@ -1,8 +1,9 @@
-"""Whether a calibration fits observations that it was not estimated from, and agrees in halves.
+"""Whether a calibration fits observations that it was not estimated from, and agrees in parts.
 
-The keyframes are split in two in the order of time. Each half estimates the calibration alone; then
-poses and points of the other half are fitted with this calibration and, for comparison, with the
-one that was there before. Nothing of a half is in the calibration that it judges.
+The keyframes are split into halves, or more parts, in the order of time. The calibration is
+estimated without each part; then poses and points of that part are fitted with this calibration
+and, for comparison, with the one that was there before. Nothing of a part is in the calibration
+that it judges.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ QUICK = CalibrationConfig(rounds=2, steps=4, tolerance=1e-3)
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Two calibrations from half the keyframes each, judged by the other half.
+    """Calibrations without one of P parts of the keyframes each, judged by that part.
 
     Attributes:
-        calibrations, sigmas: (2, 18) of the halves.
+        calibrations, sigmas: (P, 18) without each part.
         gains: (K,) of every judged keyframe, the drop of its robust cost, in units of the
-            estimated noise, from the calibration before to that of the half it is not in.
+            estimated noise, from the calibration before to that without its part.
     """
 
     calibrations: Array
@@ -50,21 +51,22 @@ class CrossValidation:
 
 
 def cross_validate(
-    problem: CalibrationProblem, judged: Sequence[int] = ALL
+    problem: CalibrationProblem, judged: Sequence[int] = ALL, parts: int = 2
 ) -> CrossValidation | None:
-    """Calibrate from each half of the keyframes, and judge by the other; None: too few views.
+    """Calibrate without each part of the keyframes, and judge by it; None: too few views.
 
     Parameters that are free but not among those ``judged``, by their places in PARAMETERS, are
-    fitted to the half that judges, with what was there before and with what was found.
+    fitted to the part that judges, with what was there before and with what was found.
     """
-    first, second = halves_of(problem)
-    if first is None or second is None:
-        return None
-    found = [calibrate(half, QUICK) for half in (first, second)]
-    gains = [
-        _gains(judge, result, list(judged))
-        for judge, result in zip((second, first), found, strict=True)
-    ]
+    count = len(problem.poses_world_camera)
+    part = np.arange(count) * parts // count
+    found, gains = [], []
+    for k in range(parts):
+        others, judge = _part_of(problem, part != k), _part_of(problem, part == k)
+        if others is None or judge is None:
+            return None
+        found.append(calibrate(others, QUICK))
+        gains.append(_gains(judge, found[-1], list(judged)))
     return CrossValidation(
         np.array([result.calibration for result in found]),
         np.array([np.sqrt(np.diag(result.covariance)) for result in found]),

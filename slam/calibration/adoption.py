@@ -5,7 +5,8 @@ adopted; the last, five coefficients, as a whole.
 
 What was found is adopted if it is observable, differs from what the camera has, is found in both
 halves of the observations, and fits the half that it was not estimated from better by two standard
-errors (`graph.calibration.cross_validation`).
+errors (`graph.calibration.cross_validation`). Half of them may be too few to know it, so quarters
+are tried if halves fail: each is judged by what the other three say.
 
 A run with a wrong camera has matched what fits that camera, which draws the estimate towards it. So
 its landmarks are searched again (`calibration.rematching`).
@@ -38,6 +39,8 @@ CALIBRATE = ("auto", "report", "off")
 """Whether what is found is used, only told, or not looked for."""
 NAMES = {SHUTTER: "rolling shutter", TIME: "colour-depth delay"}
 MAX_S = 0.035
+PARTS = 2, 4
+"""Into which the keyframes are split, one after the other, until the proof succeeds."""
 UNOBSERVABLE = "readout, delay and bend of depth not observable in the motion"
 PLACES = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-0.75, 0.75, 7)), axis=-1)
 BEND_TERMS = depth_distortion_terms(PLACES).reshape(-1, len(BENDS))
@@ -129,24 +132,24 @@ class Estimate:
         sigma = _rms_sigma(self.sigmas[BEND]) if i in BENDS else self.sigmas[i]
         return bool(0 < sigma < config.limits(i)[0])
 
-    def agrees(self, i: int, halves: CrossValidation, config: SelfCalibrationConfig) -> bool:
-        """Whether both halves alone find a parameter: within their bounds, or nearer to what was
+    def agrees(self, i: int, parts: CrossValidation, config: SelfCalibrationConfig) -> bool:
+        """Whether a parameter is found without each part: within its bounds, or nearer to what was
         found than to what the camera has. The distortion of depth is compared over the image.
         """
         if i in BENDS:
-            return self._bend_agrees(halves, config)
-        bounds = config.min_change_sigmas * np.hypot(halves.sigmas[:, i], self.sigmas[i])
+            return self._bend_agrees(parts, config)
+        bounds = config.min_change_sigmas * np.hypot(parts.sigmas[:, i], self.sigmas[i])
         nearer = abs(self.found[i] - self.before[i]) / 2
-        off = np.abs(halves.calibrations[:, i] - self.found[i])
+        off = np.abs(parts.calibrations[:, i] - self.found[i])
         return bool((off <= np.maximum(bounds, nearer)).all())
 
-    def _bend_agrees(self, halves: CrossValidation, config: SelfCalibrationConfig) -> bool:
+    def _bend_agrees(self, parts: CrossValidation, config: SelfCalibrationConfig) -> bool:
         found, sigma = self.found[BEND], _rms_sigma(self.sigmas[BEND])
         nearer = _rms(found - self.before[BEND]) / 2
         return all(
-            _rms(half[BEND] - found)
+            _rms(other[BEND] - found)
             <= max(nearer, config.min_change_sigmas * np.hypot(_rms_sigma(sigmas[BEND]), sigma))
-            for half, sigmas in zip(halves.calibrations, halves.sigmas, strict=True)
+            for other, sigmas in zip(parts.calibrations, parts.sigmas, strict=True)
         )
 
 
@@ -201,16 +204,27 @@ def newly_sure(
 ) -> list[int]:
     """Those of the parameters tried that are to be adopted."""
     sure = [i for i in tried if estimate.differs(i, config)]
-    halves = cross_validate(estimate.problem, FREE) if sure else None
-    if halves is None:
-        return []
-    logger.info(
-        "calibration: better on observations kept out of the fit by %.1f standard errors",
-        halves.gain_sigmas,
-    )
-    if halves.gain_sigmas < config.min_gain_sigmas:
-        return []
-    agreed = {i for i in sure if estimate.agrees(i, halves, config)}
+    for parts in PARTS if sure else ():
+        judged_by_parts = cross_validate(estimate.problem, FREE, parts)
+        if judged_by_parts is None:
+            break
+        gain_sigmas = judged_by_parts.gain_sigmas
+        logger.info(
+            "calibration: better on observations kept out of the fit by %.1f standard errors "
+            "(%d parts)",
+            gain_sigmas,
+            parts,
+        )
+        if gain_sigmas >= config.min_gain_sigmas:
+            return _agreed(estimate, sure, judged_by_parts, config)
+    return []
+
+
+def _agreed(
+    estimate: Estimate, sure: list[int], parts: CrossValidation, config: SelfCalibrationConfig
+) -> list[int]:
+    """Those that are found without each part; of the distortion of depth all or none."""
+    agreed = {i for i in sure if estimate.agrees(i, parts, config)}
     if agreed & set(BENDS):  # one surface, of which no part is right alone
         possible = np.abs(estimate.found[BEND]).max() < config.max_bend
         agreed = agreed | set(BENDS) if possible else agreed - set(BENDS)

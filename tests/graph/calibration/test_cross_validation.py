@@ -1,10 +1,11 @@
-"""Calibrations from half of the views, evaluated on the other half."""
+"""Calibrations from some of the keyframes, evaluated on the others."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
+import pytest
 from calibration_scene import PRIORS, TRUTH, make_problem
 
 from bmask_slam.graph.calibration.cross_validation import cross_validate
@@ -19,9 +20,11 @@ def _problem(truth, start, keyframes=20):
     return dataclasses.replace(problem, prior_sigmas=TIMES_ONLY)
 
 
-def test_both_halves_confirm_a_rolling_shutter() -> None:
-    found = cross_validate(_problem(ROLLING, np.where(np.arange(18) == SHUTTER, 0.0, ROLLING)))
-    assert found is not None
+@pytest.mark.parametrize("parts", [2, 4])
+def test_every_part_confirms_a_rolling_shutter(parts: int) -> None:
+    none = np.where(np.arange(18) == SHUTTER, 0.0, ROLLING)
+    found = cross_validate(_problem(ROLLING, none), parts=parts)
+    assert found is not None and len(found.calibrations) == parts
     error = found.calibrations - ROLLING
     assert (np.abs(error)[:, SHUTTER] < 4 * found.sigmas[:, SHUTTER]).all()
     assert (found.calibrations[:, SHUTTER] > 0.018).all()  # and not -0.020
@@ -29,8 +32,9 @@ def test_both_halves_confirm_a_rolling_shutter() -> None:
     assert len(found.gains) == 20 and found.gain_sigmas > 4
 
 
-def test_a_correct_camera_is_not_improved() -> None:
-    found = cross_validate(_problem(ROLLING, ROLLING))
+@pytest.mark.parametrize("parts", [2, 4])
+def test_a_correct_camera_is_not_improved(parts: int) -> None:
+    found = cross_validate(_problem(ROLLING, ROLLING), parts=parts)
     assert found is not None
     assert found.gain_sigmas < 2
     assert np.abs(found.calibrations - ROLLING)[:, SHUTTER].max() < 0.001
@@ -61,3 +65,4 @@ def test_what_is_fitted_along_is_no_gain() -> None:
 
 def test_too_few_keyframes_give_no_result() -> None:
     assert cross_validate(make_problem(keyframes=8)[0]) is None
+    assert cross_validate(make_problem(keyframes=16)[0], parts=4) is None

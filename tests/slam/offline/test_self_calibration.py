@@ -24,6 +24,7 @@ from bmask_slam.calibration.adoption import (
     camera_with,
     format_found,
     judged,
+    newly_sure,
 )
 from bmask_slam.calibration.camera_check import CameraCheck
 from bmask_slam.calibration.priors import estimated_priors
@@ -196,6 +197,32 @@ def test_both_halves_have_to_find_what_is_adopted(
     calibrations[:, TIME] = 1e-3 * np.array(halves_ms)
     halves = CrossValidation(calibrations, np.full((2, 18), 0.001), np.zeros(4))
     assert estimate.agrees(TIME, halves, SelfCalibrationConfig()) is agrees
+
+
+@pytest.mark.parametrize(
+    ("gains", "asked", "adopted"),
+    [((3.0, -9.0), [2], True), ((-1.0, 3.0), [2, 4], True), ((1.0, 1.0), [2, 4], False)],
+)
+def test_quarters_are_asked_where_halves_prove_nothing(
+    monkeypatch: pytest.MonkeyPatch, gains: tuple[float, float], asked: list[int], adopted: bool
+) -> None:
+    """Of 26 +- 0.5 ms found for a camera without readout time."""
+    found = np.where(np.arange(18) == SHUTTER, 0.026, 0.0)
+    sigmas = np.where(np.arange(18) == SHUTTER, 0.0005, 0.0)
+    estimate = Estimate(np.zeros(18), found, sigmas, None)  # type: ignore[arg-type]
+    parts_asked: list[int] = []
+
+    def proof(_: object, judged: tuple[int, ...], parts: int) -> CrossValidation:
+        assert judged == FREE
+        parts_asked.append(parts)
+        mean = gains[len(parts_asked) - 1]
+        return CrossValidation(
+            np.tile(found, (parts, 1)), np.full((parts, 18), 0.001), mean + np.array([-1.0, 1.0])
+        )
+
+    monkeypatch.setattr("bmask_slam.calibration.adoption.cross_validate", proof)
+    sure = newly_sure(estimate, FREE, SelfCalibrationConfig())
+    assert parts_asked == asked and sure == ([SHUTTER] if adopted else [])
 
 
 @pytest.mark.parametrize(
