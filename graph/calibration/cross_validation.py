@@ -58,8 +58,7 @@ def cross_validate(
     Parameters that are free but not among those ``judged``, by their places in PARAMETERS, are
     fitted to the part that judges, with what was there before and with what was found.
     """
-    count = len(problem.poses_world_camera)
-    part = np.arange(count) * parts // count
+    part = _part_numbers(problem, parts)
     found, gains = [], []
     for k in range(parts):
         others, judge = _part_of(problem, part != k), _part_of(problem, part == k)
@@ -78,9 +77,14 @@ def halves_of(
     problem: CalibrationProblem,
 ) -> tuple[CalibrationProblem | None, CalibrationProblem | None]:
     """The problems of the first and the last half of the keyframes; None for too few views."""
+    part = _part_numbers(problem, 2)
+    return _part_of(problem, part == 0), _part_of(problem, part == 1)
+
+
+def _part_numbers(problem: CalibrationProblem, parts: int) -> Ints:
+    """The part, from 0, of each keyframe (K,): in the order of time, about equally large."""
     count = len(problem.poses_world_camera)
-    late = np.arange(count) >= count // 2
-    return _part_of(problem, ~late), _part_of(problem, late)
+    return (np.arange(count) * parts + parts - 1) // count
 
 
 def _part_of(problem: CalibrationProblem, keyframes: Mask) -> CalibrationProblem | None:
