@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from bmask_slam.back_end.reinterpretation import KeyframeMotion, use_camera
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import quaternion_from_rotation
 from bmask_slam.graph.sensors.streams import Measurements, measurements
@@ -96,7 +99,10 @@ class SensorInput(ABC):
 
 
 class SensorSystem(SystemResults, SensorInput):
-    """A system with its map and graph in this process, which takes measurements and factors."""
+    """A system with its map and graph in this process, which takes measurements and factors.
+
+    It can go on with another camera too, which its frames' depth images follow.
+    """
 
     camera_tracker: CameraTracker
 
@@ -113,6 +119,11 @@ class SensorSystem(SystemResults, SensorInput):
     def remove_factor(self, number: int) -> None:
         """See `SensorInput.remove_factor`; the graph is optimised at once."""
         self._change_factors([], (number,))
+
+    def use_camera(self, camera: Camera, motions: Mapping[int, KeyframeMotion]) -> None:
+        """Go on with another camera; keyframes of known motion are interpreted anew by it."""
+        self.camera = self.camera_tracker.tracker.camera = camera
+        use_camera(self.mapper, camera, motions)
 
     def _change_factors(self, added: list[tuple[int, Any]], removed: tuple[int, ...]) -> None:
         """Change the graph; tracking moves with the map."""

@@ -1,9 +1,12 @@
 """Whether a calibration fits observations that it was not estimated from, and agrees in parts.
 
-The keyframes are split into halves, or more parts, in the order of time. The calibration is
-estimated without each part; then poses and points of that part are fitted with this calibration
-and, for comparison, with the one that was there before. Nothing of a part is in the calibration
-that it judges.
+The keyframes are split into two halves. The calibration is estimated from each; then poses and
+points of the other half are fitted with it and, for comparison, with the one that was there before.
+Nothing of a half is in the calibration that it judges.
+
+Halves in the order of time share no landmark, but either may leave some of a calibration
+undetermined, which the other then refuses. If every second keyframe is in the other half, both have
+seen and turned as the camera did; but neighbours are farther apart, and share fewer landmarks.
 """
 
 from __future__ import annotations
@@ -31,12 +34,12 @@ QUICK = CalibrationConfig(rounds=2, steps=4, tolerance=1e-3)
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Calibrations without one of P parts of the keyframes each, judged by that part.
+    """Calibrations from two halves of the keyframes, each judged by the other half.
 
     Attributes:
-        calibrations, sigmas: (P, 18) without each part.
+        calibrations, sigmas: (2, 18) from each half.
         gains: (K,) of every judged keyframe, the drop of its robust cost, in units of the
-            estimated noise, from the calibration before to that without its part.
+            estimated noise, from the calibration before to that of the other half.
     """
 
     calibrations: Array
@@ -51,20 +54,19 @@ class CrossValidation:
 
 
 def cross_validate(
-    problem: CalibrationProblem, judged: Sequence[int] = ALL, parts: int = 2
+    problem: CalibrationProblem, judged: Sequence[int] = ALL, alternately: bool = False
 ) -> CrossValidation | None:
-    """Calibrate without each part of the keyframes, and judge by it; None: too few views.
+    """Calibrate from each half of the keyframes, and judge by the other; None: too few views.
 
     Parameters that are free but not among those ``judged``, by their places in PARAMETERS, are
-    fitted to the part that judges, with what was there before and with what was found.
+    fitted to the half that judges, with what was there before and with what was found.
     """
-    part = _part_numbers(problem, parts)
+    halves = halves_of(problem, alternately)
     found, gains = [], []
-    for k in range(parts):
-        others, judge = _part_of(problem, part != k), _part_of(problem, part == k)
-        if others is None or judge is None:
+    for own, judge in (halves, halves[::-1]):
+        if own is None or judge is None:
             return None
-        found.append(calibrate(others, QUICK))
+        found.append(calibrate(own, QUICK))
         gains.append(_gains(judge, found[-1], list(judged)))
     return CrossValidation(
         np.array([result.calibration for result in found]),
@@ -74,17 +76,15 @@ def cross_validate(
 
 
 def halves_of(
-    problem: CalibrationProblem,
+    problem: CalibrationProblem, alternately: bool = False
 ) -> tuple[CalibrationProblem | None, CalibrationProblem | None]:
-    """The problems of the first and the last half of the keyframes; None for too few views."""
-    part = _part_numbers(problem, 2)
-    return _part_of(problem, part == 0), _part_of(problem, part == 1)
+    """The problems of the first and the last half of the keyframes; None for too few views.
 
-
-def _part_numbers(problem: CalibrationProblem, parts: int) -> Ints:
-    """The part, from 0, of each keyframe (K,): in the order of time, about equally large."""
+    Or of every second keyframe, ``alternately``.
+    """
     count = len(problem.poses_world_camera)
-    return (np.arange(count) * parts + parts - 1) // count
+    last = np.arange(count) % 2 == 1 if alternately else np.arange(count) >= count // 2
+    return _part_of(problem, ~last), _part_of(problem, last)
 
 
 def _part_of(problem: CalibrationProblem, keyframes: Mask) -> CalibrationProblem | None:

@@ -3,20 +3,20 @@
 Of a camera's parameters the readout time, the delay of depth and the distortion of depth may be
 adopted; the last, five coefficients, as a whole.
 
-What was found is adopted if it is observable, differs from what the camera has, is found in both
-halves of the observations, and fits the half that it was not estimated from better by two standard
-errors (`graph.calibration.cross_validation`). Half of them may be too few to know it, so quarters
-are tried if halves fail: each is judged by what the other three say.
+What was found is adopted if it is observable, differs from what the camera given for the run has,
+is found by either half of the keyframes, and fits the half that it was not estimated from better by
+two standard errors (`graph.calibration.cross_validation`). Where halves in the order of time do not
+prove it, every second keyframe is in the other half.
 
 A run with a wrong camera has matched what fits that camera, which draws the estimate towards it. So
-its landmarks are searched again (`calibration.rematching`).
+its landmarks are searched again (`calibration.rematching`), and its last look, with all frames and
+a map of the camera found before, decides on all of it anew.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,8 +39,6 @@ CALIBRATE = ("auto", "report", "off")
 """Whether what is found is used, only told, or not looked for."""
 NAMES = {SHUTTER: "rolling shutter", TIME: "colour-depth delay"}
 MAX_S = 0.035
-PARTS = 2, 4
-"""Into which the keyframes are split, one after the other, until the proof succeeds."""
 UNOBSERVABLE = "readout, delay and bend of depth not observable in the motion"
 PLACES = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-0.75, 0.75, 7)), axis=-1)
 BEND_TERMS = depth_distortion_terms(PLACES).reshape(-1, len(BENDS))
@@ -118,7 +116,7 @@ class Estimate:
     problem: CalibrationProblem
 
     def differs(self, i: int, config: SelfCalibrationConfig) -> bool:
-        """Whether a parameter is observable, possible, and not what the camera has."""
+        """Whether a parameter is observable, possible, and not that of the camera given."""
         _, min_change, largest = config.limits(i)
         change = abs(self.found[i] - self.before[i])
         return bool(
@@ -127,29 +125,43 @@ class Estimate:
             and abs(self.found[i]) - 1.96 * self.sigmas[i] < largest
         )
 
+    def contradicts(self, camera: Camera, config: SelfCalibrationConfig) -> bool:
+        """Whether a camera found before has another time, or depth bent otherwise over the image.
+
+        By the limits of ``differs``.
+        """
+        change = self.found - parameters_of(camera, camera.depth_scale)
+        apart = [(i, abs(change[i]), self.sigmas[i], config.min_change_s) for i in TIMES]
+        bend = _rms(change[BEND]), _rms_sigma(self.sigmas[BEND])
+        apart.append((BENDS[0], *bend, config.min_bend))
+        return any(
+            self.shows(i, config) and step > max(config.min_change_sigmas * sigma, least)
+            for i, step, sigma, least in apart
+        )
+
     def shows(self, i: int, config: SelfCalibrationConfig) -> bool:
         """Whether a parameter is observable; the distortion of depth is so over the whole image."""
         sigma = _rms_sigma(self.sigmas[BEND]) if i in BENDS else self.sigmas[i]
         return bool(0 < sigma < config.limits(i)[0])
 
-    def agrees(self, i: int, parts: CrossValidation, config: SelfCalibrationConfig) -> bool:
-        """Whether a parameter is found without each part: within its bounds, or nearer to what was
-        found than to what the camera has. The distortion of depth is compared over the image.
+    def agrees(self, i: int, halves: CrossValidation, config: SelfCalibrationConfig) -> bool:
+        """Whether either half finds a parameter: within its bounds, or nearer to what was found
+        than to what the camera has. The distortion of depth is compared over the image.
         """
         if i in BENDS:
-            return self._bend_agrees(parts, config)
-        bounds = config.min_change_sigmas * np.hypot(parts.sigmas[:, i], self.sigmas[i])
+            return self._bend_agrees(halves, config)
+        bounds = config.min_change_sigmas * np.hypot(halves.sigmas[:, i], self.sigmas[i])
         nearer = abs(self.found[i] - self.before[i]) / 2
-        off = np.abs(parts.calibrations[:, i] - self.found[i])
+        off = np.abs(halves.calibrations[:, i] - self.found[i])
         return bool((off <= np.maximum(bounds, nearer)).all())
 
-    def _bend_agrees(self, parts: CrossValidation, config: SelfCalibrationConfig) -> bool:
+    def _bend_agrees(self, halves: CrossValidation, config: SelfCalibrationConfig) -> bool:
         found, sigma = self.found[BEND], _rms_sigma(self.sigmas[BEND])
         nearer = _rms(found - self.before[BEND]) / 2
         return all(
             _rms(other[BEND] - found)
             <= max(nearer, config.min_change_sigmas * np.hypot(_rms_sigma(sigmas[BEND]), sigma))
-            for other, sigmas in zip(parts.calibrations, parts.sigmas, strict=True)
+            for other, sigmas in zip(halves.calibrations, halves.sigmas, strict=True)
         )
 
 
@@ -176,19 +188,26 @@ def judged(
     config: SelfCalibrationConfig,
     free: tuple[int, ...] = FREE,
 ) -> SelfCalibration:
-    """The state after an estimate. What was adopted is not estimated again.
+    """The state after an estimate, which is of the camera given.
 
     A parameter that does not show yet is looked for again later, unless one was adopted. Only those
-    of ``free`` may be; with a mode other than "auto" it is only told.
+    of ``free`` may be; with a mode other than "auto" it is only told. What was adopted before takes
+    the value of this estimate if that contradicts the camera in use, and stays otherwise.
     """
-    sure = [i for i in newly_sure(estimate, FREE, config) if i in free]
+    if state.adopted and not estimate.contradicts(state.camera, config):
+        return state
+    sure = {i for i in surely_other(estimate, config) if i in free}
     if sure:
+        before = {i for i in adopted_parameters(state) if estimate.shows(i, config)}
+        chosen = sorted(sure | before)
         verdict = "found and applied" if mode == "auto" else "found, not applied"
-        text = format_found(estimate, sure, verdict)
+        text = format_found(estimate, chosen, verdict)
         if mode != "auto":
             return dataclasses.replace(state, text=text, settled=True)
-        camera = camera_with(state.given, estimate.found, sure)
+        camera = camera_with(state.camera, estimate.found, chosen)
         return dataclasses.replace(state, camera=camera, text=text, settled=True)
+    if state.adopted:
+        return state
     seen = [i for i in free if estimate.shows(i, config)]
     differs = any(estimate.differs(i, config) for i in free)
     verdict = "not sure enough to be applied" if differs else "the camera keeps it"
@@ -199,32 +218,35 @@ def judged(
     return dataclasses.replace(state, text=text, looks=looks, settled=settled)
 
 
-def newly_sure(
-    estimate: Estimate, tried: Iterable[int], config: SelfCalibrationConfig
-) -> list[int]:
-    """Those of the parameters tried that are to be adopted."""
-    sure = [i for i in tried if estimate.differs(i, config)]
-    for parts in PARTS if sure else ():
-        judged_by_parts = cross_validate(estimate.problem, FREE, parts)
-        if judged_by_parts is None:
+def adopted_parameters(state: SelfCalibration) -> set[int]:
+    """Those that were adopted, the distortion of depth as a whole."""
+    given, used = (parameters_of(c, c.depth_scale) for c in (state.given, state.camera))
+    changed = set(np.flatnonzero(given != used).tolist())
+    return changed | set(BENDS) if changed & set(BENDS) else changed
+
+
+def surely_other(estimate: Estimate, config: SelfCalibrationConfig) -> list[int]:
+    """The parameters that are surely not those of the camera given."""
+    differing = [i for i in FREE if estimate.differs(i, config)]
+    for alternately in (False, True) if differing else ():
+        halves = cross_validate(estimate.problem, FREE, alternately)
+        if halves is None:
             break
-        gain_sigmas = judged_by_parts.gain_sigmas
         logger.info(
-            "calibration: better on observations kept out of the fit by %.1f standard errors "
-            "(%d parts)",
-            gain_sigmas,
-            parts,
+            "calibration: better on observations kept out of the fit by %.1f standard errors%s",
+            halves.gain_sigmas,
+            " (every second keyframe)" if alternately else "",
         )
-        if gain_sigmas >= config.min_gain_sigmas:
-            return _agreed(estimate, sure, judged_by_parts, config)
+        if halves.gain_sigmas >= config.min_gain_sigmas:
+            return _agreed(estimate, differing, halves, config)
     return []
 
 
 def _agreed(
-    estimate: Estimate, sure: list[int], parts: CrossValidation, config: SelfCalibrationConfig
+    estimate: Estimate, differing: list[int], halves: CrossValidation, config: SelfCalibrationConfig
 ) -> list[int]:
-    """Those that are found without each part; of the distortion of depth all or none."""
-    agreed = {i for i in sure if estimate.agrees(i, parts, config)}
+    """Those that both halves find; of the distortion of depth all or none."""
+    agreed = {i for i in differing if estimate.agrees(i, halves, config)}
     if agreed & set(BENDS):  # one surface, of which no part is right alone
         possible = np.abs(estimate.found[BEND]).max() < config.max_bend
         agreed = agreed | set(BENDS) if possible else agreed - set(BENDS)

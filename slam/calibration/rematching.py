@@ -178,15 +178,16 @@ class RunProblem:
     Args:
         world, run: of the same system, at the same moment.
         reader: depth images of its keyframes.
+        given: the camera that is in question; the run's may have more, which was found before.
 
     Raises:
         InputError: a keyframe's depth image is missing or broken.
     """
 
-    def __init__(self, world: WorldMap, run: SavedRun, reader: DepthReader) -> None:
+    def __init__(self, world: WorldMap, run: SavedRun, reader: DepthReader, given: Camera) -> None:
         seen = connected_views(run.tables, reader.keyframe_ids, MAX_KEYFRAMES)
         seen = seen.select(world.landmarks.in_map[seen.landmark_ids])
-        self._reader, self._camera = reader, run.camera
+        self._reader, self._camera, self._given = reader, run.camera, given
         self._keyframe_ids = np.unique(seen.keyframe_ids)
         landmark_ids, views = np.unique(seen.landmark_ids, return_counts=True)
         most = np.argsort(-views, kind="stable")
@@ -228,10 +229,10 @@ class RunProblem:
             sigma_inverse=np.hypot(nominal, depths.rms),
             shutter_velocity=share_of_rows(found.pixels[:, 1], camera)[:, None] * moving,
         )
-        start = parameters_of(camera, camera.depth_scale)
+        start = parameters_of(self._given, self._given.depth_scale)
         poses, points_world = self._poses[keyframe_rows], self._points[landmark_rows]
         return CalibrationProblem(
-            views, poses, points_world, start, estimated_priors(camera, FREE), GAUGE_SIGMAS
+            views, poses, points_world, start, estimated_priors(self._given, FREE), GAUGE_SIGMAS
         )
 
     def move_to(self, result: CalibrationResult) -> None:
@@ -256,16 +257,17 @@ class RunProblem:
 
 
 def estimate_again(
-    world: WorldMap, run: SavedRun, reader: DepthReader, worth_s: float
+    world: WorldMap, run: SavedRun, reader: DepthReader, given: Camera, worth_s: float
 ) -> Estimate | None:
-    """What a run's keyframes say of its camera; None if they are too few.
+    """What a run's keyframes say of the camera given for it; None if they are too few.
 
-    If the first round changes neither time by ``worth_s``, there is no other.
+    Landmarks are searched with the run's camera first, then with that found. If the first round
+    finds the given camera's times, within ``worth_s``, there is no other.
 
     Raises:
         InputError: a keyframe's depth image is missing or broken.
     """
-    problems = RunProblem(world, run, reader)
+    problems = RunProblem(world, run, reader, given)
     if not problems.large_enough:
         return None
     shutter_s, estimate = run.camera.rolling_shutter_s, None

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
@@ -21,7 +22,6 @@ from bmask_slam.labelling.results import LandmarkLabels
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.live.messages import (
     STATE_FILE,
-    CameraEstimated,
     ChangeOwnFactors,
     ImageToSegment,
     Masks,
@@ -132,11 +132,10 @@ class LiveSystem(SlamSystem):
         made = result.keyframe_id
         return None if made is None else self.remote.world.keyframes.get(made)
 
-    def use_camera(self, found: CameraEstimated) -> None:
+    def use_camera(self, camera: Camera, motions: Mapping[int, KeyframeMotion]) -> None:
         """Track with another camera from the next frame on, and tell the map."""
-        if found.camera is not None:
-            self.camera = self.camera_tracker.tracker.camera = found.camera
-            self.remote.send(UseCamera(found.camera, found.motions))
+        self.camera = self.camera_tracker.tracker.camera = camera
+        self.remote.send(UseCamera(camera, dict(motions)))
 
     def add_measurements(self, new: Measurements) -> None:
         """Use the measurements of a sensor with the next frame; from any thread."""
@@ -173,9 +172,10 @@ class LiveSystem(SlamSystem):
         if reference is not None and T_before is not None and self.remote.changes != changes:
             self._follow_map(reference, T_before)
         if self.calibration is not None:
-            times = self.calibration.update(self.remote)
-            if times is not None:
-                self.use_camera(times)
+            answer = self.calibration.update(self.remote)
+            if answer is not None:
+                if answer.camera is not None:
+                    self.use_camera(answer.camera, answer.motions)
                 self.events.calibration(self.calibration.text)
 
     def _follow_map(self, reference: Keyframe, T_before: Array) -> None:

@@ -1,28 +1,22 @@
-"""The frames of one run through the system, recorded on the way, and the end of the run."""
+"""The frames of one run through the system, recorded on the way."""
 
 from __future__ import annotations
 
 import logging
-import signal
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bmask_slam.calibration.camera_check import CameraCheck, check_camera
-from bmask_slam.evaluation import Row
 from bmask_slam.features.brisk import Features
-from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.graph.whole_file import remove
 from bmask_slam.offline.checkpoint import Checkpoints
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.offline.self_calibration import SelfCalibrator
-from bmask_slam.run_folder.folder import CAMERA, CHECKPOINT, DENSE, RunFolder
-from bmask_slam.run_folder.metrics import RunCounters, measure, save
-from bmask_slam.runtime.memory import give_back_memory
+from bmask_slam.run_folder.folder import CAMERA, DENSE, RunFolder
+from bmask_slam.run_folder.metrics import RunCounters
 from bmask_slam.runtime.progress import Progress
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.sequences.cameras import format_camera
@@ -90,31 +84,6 @@ def run_indices(sequence: Sequence, options: RunOptions) -> range:
     return range(0, end, stride)
 
 
-@dataclass(frozen=True)
-class RunSummary:
-    """How a run ended.
-
-    Attributes:
-        folder: the run folder.
-        rows: what metrics.json holds.
-        frames: frames given to the system.
-        skipped: frames that were broken, not counted in ``frames``.
-        stopped_by: the signal that ended the run early, or None.
-        calibration: what was found of the camera, in one line; "" if nothing was tried.
-        warnings: what the run says against its camera, each with its evidence.
-        resumable: the run can be resumed from its last checkpoint, since it was stopped.
-    """
-
-    folder: Path
-    rows: list[Row]
-    frames: int
-    skipped: int
-    stopped_by: signal.Signals | None = None
-    resumable: bool = False
-    calibration: str = ""
-    warnings: tuple[str, ...] = ()
-
-
 def _begin(run: ActiveRun, checkpoints: Checkpoints) -> None:
     """Before the first frame: the checkpoint, the camera that was found, and that as an event.
 
@@ -122,8 +91,7 @@ def _begin(run: ActiveRun, checkpoints: Checkpoints) -> None:
     sizes, was written: a kill at any moment leaves files that fit the checkpoint.
     """
     found, events, first = run.calibrator.state, run.system.events, run.indices[:1]
-    if found.adopted:
-        run.folder.write_text(CAMERA, format_camera(found.camera, found.text))
+    write_found_camera(run)
     checkpoints.write(run.system, run.counters)
     run.folder.begin_anew()
     if found.adopted and not run.options.map:
@@ -171,6 +139,13 @@ def process_frames(run: ActiveRun) -> bool:
     return False
 
 
+def write_found_camera(run: ActiveRun) -> None:
+    """Write the camera that was found, if one was."""
+    found = run.calibrator.state
+    if found.adopted:
+        run.folder.write_text(CAMERA, format_camera(found.camera, found.text))
+
+
 def _plain(run: ActiveRun) -> Generator[tuple[Frame], None, None]:
     """The remaining frames."""
     remaining = run.remaining
@@ -196,63 +171,6 @@ def _is_to_begin_anew(run: ActiveRun, last: bool) -> bool:
     return anew
 
 
-def finish_run(run: ActiveRun) -> RunSummary:
-    """Finish the system, measure and save; a run that was not stopped is complete then."""
-    counters, options, stopped_by = run.counters, run.options, run.stop.signal
-    run.system.finish()
-    give_back_memory()  # ISAM2's, which is not needed any more
-    run.folder.write_events(run.system.events.take())
-    rows = measure(run.system, run.reference, counters, options.stride)
-    checked = _camera_checked(run)
-    rows += checked.rows
-    title = "-".join(filter(None, (run.sequence.name, options.config_name)))
-    save(run.system, run.folder, rows, run.reference, title)
-    if options.dense:
-        from bmask_slam.dense.map_run import map_run  # noqa: PLC0415 - loads torch
-
-        map_run(_map_options(run))
-    if stopped_by is None:
-        run.folder.complete()
-    skipped = sum(index < counters.next_index for index, _ in run.sequence.skipped)
-    folder = run.folder.path
-    resumable = stopped_by is not None and (folder / CHECKPOINT).is_file()
-    text = run.calibrator.state.text
-    return RunSummary(
-        folder,
-        rows,
-        counters.frames,
-        skipped,
-        stopped_by,
-        resumable,
-        text,
-        checked.warnings + _unwritten_checkpoints(run),
-    )
-
-
-def _unwritten_checkpoints(run: ActiveRun) -> tuple[str, ...]:
-    """A warning if there are any; a resumed run would have begun with an earlier one."""
-    if not run.unwritten:
-        return ()
-    return (f"{len(run.unwritten)} checkpoints not written, the last: {run.unwritten[-1]}",)
-
-
-def _camera_checked(run: ActiveRun) -> CameraCheck:
-    """What a run that was not stopped says against its camera, which is logged too."""
-    nothing = CameraCheck((), (), ())
-    if not isinstance(run.system, SlamSystem) or run.stop.signal is not None:
-        return nothing
-    try:
-        checked = check_camera(run.system.as_run(), run.sequence)
-    except InputError as error:
-        logger.info("camera not checked: %s", error)
-        return nothing
-    for text in checked.notes:
-        logger.info("camera: %s", text)
-    for text in checked.warnings:
-        logger.warning("camera: %s", text)
-    return checked
-
-
 def _dense_follower(run: ActiveRun) -> Callable[[FrameResult], None]:
     """A function that fuses keyframes into the dense map while the run goes on."""
     from bmask_slam.dense.map_run import dense_follower  # noqa: PLC0415 - loads torch
@@ -260,11 +178,12 @@ def _dense_follower(run: ActiveRun) -> Callable[[FrameResult], None]:
     if not isinstance(run.system, SlamSystem):
         return lambda result: None
     return dense_follower(
-        run.system.mapper.world, run.system.semantics, run.sequence, _map_options(run)
+        run.system.mapper.world, run.system.semantics, run.sequence, map_options(run)
     )
 
 
-def _map_options(run: ActiveRun) -> MapOptions:
+def map_options(run: ActiveRun) -> MapOptions:
+    """How the dense map of a run is made."""
     from bmask_slam.dense.options import MapOptions  # noqa: PLC0415 - loads torch
 
     return MapOptions(run.folder.path, mesh_voxel_m=run.options.mesh_voxel_m)

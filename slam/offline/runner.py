@@ -25,14 +25,10 @@ from bmask_slam.graph.sensors.streams import read_folder
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps
 from bmask_slam.labelling.mask_memory import MaskMemory, RememberingSegmenter
 from bmask_slam.offline.checkpoint import Checkpoint, read_checkpoint
-from bmask_slam.offline.frame_loop import (
-    ActiveRun,
-    RunSummary,
-    finish_run,
-    process_frames,
-)
+from bmask_slam.offline.frame_loop import ActiveRun, process_frames
 from bmask_slam.offline.map_localisation import MapLocalisation
 from bmask_slam.offline.options import RunOptions
+from bmask_slam.offline.run_end import RunSummary, finish_run
 from bmask_slam.offline.self_calibration import SelfCalibrator
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder
 from bmask_slam.run_folder.map_file import read_map

@@ -7,6 +7,10 @@ those of a published calibration are better than what a short stretch shows, and
 depth scale, which images and depths alone do not show, would be taken for one of theirs. A readout
 time that the camera has is kept. Whether they are adopted is decided in `calibration.adoption`. If
 none is, the run goes on; else it begins anew, once, with the camera that was found.
+
+After the last frame such a run is looked at once more. Its map shows more than the first stretch,
+and was not bent by the wrong camera. The keyframes are interpreted anew with what is found then,
+before the last optimisation; no frame is tracked again.
 """
 
 from __future__ import annotations
@@ -14,6 +18,9 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
+import numpy as np
+
+from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.calibration.adoption import (
     FREE,
     Estimate,
@@ -22,13 +29,17 @@ from bmask_slam.calibration.adoption import (
     format_found,
     judged,
 )
+from bmask_slam.calibration.keyframe_motions import depth_change_between, keyframe_motions
 from bmask_slam.calibration.rematching import estimate_again
 from bmask_slam.calibration.views import SequenceDepths
+from bmask_slam.graph.arrays import Array, Ints, no_ids
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.labelling.mask_memory import MaskMemory
 from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_interface import System
+from bmask_slam.world.keyframe import Keyframe
 
 logger = logging.getLogger(__name__)
 
@@ -86,6 +97,23 @@ class SelfCalibrator:
         self._forget_masks()
         return self.state.camera != before.camera
 
+    def look_back(self, system: System, sequence: Sequence) -> bool:
+        """After the last frame: use what all frames show; whether the camera is another one now."""
+        before = self.state
+        looked = before.adopted or (self.finished and not before.settled)
+        if self._mode != "auto" or not looked or not isinstance(system, SlamSystem):
+            return False
+        estimate = self._estimate(system, sequence)
+        if estimate is not None:
+            self.state = judged(before, estimate, self._mode, self._config)
+        camera = self.state.camera
+        if camera == before.camera:
+            return False
+        logger.info("calibration: by all frames: %s", self.state.text)
+        system.events.calibration(self.state.text)
+        system.use_camera(camera, _motions(system, sequence, camera))
+        return True
+
     def _forget_masks(self) -> None:
         if self._masks is not None and (self.finished or self._mode == "report"):
             self._masks.forget()
@@ -96,12 +124,32 @@ class SelfCalibrator:
             return None
         world, worth_s = system.mapper.world, self._config.min_change_s
         try:
-            stamps_s = {k.id: k.timestamp_s for k in world.keyframes.values()}
-            reader = SequenceDepths(stamps_s, sequence)
-            estimate = estimate_again(world, system.as_run(), reader, worth_s)
+            reader, given = _reader(system, sequence), self.state.given
+            estimate = estimate_again(world, system.as_run(), reader, given, worth_s)
         except InputError as error:
             logger.info("calibration: %s", error)
             return None
         if estimate is not None:
             logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
         return estimate
+
+
+def _reader(system: SlamSystem, sequence: Sequence) -> SequenceDepths:
+    keyframes = system.mapper.world.keyframes.values()
+    return SequenceDepths({k.id: k.timestamp_s for k in keyframes}, sequence)
+
+
+def _motions(system: SlamSystem, sequence: Sequence, camera: Camera) -> dict[int, KeyframeMotion]:
+    """By what the keyframes are interpreted anew with a camera that replaces the system's."""
+    world, offset_s = system.mapper.world, camera.depth_time_offset_s
+    retimed = sequence.with_camera(replace(sequence.camera, depth_time_offset_s=offset_s))
+
+    def change(keyframe: Keyframe) -> tuple[Ints, Array]:
+        try:
+            return depth_change_between(sequence, retimed, keyframe, system.config.features)
+        except InputError as error:
+            logger.warning("calibration: the delay of a keyframe's depth stays: %s", error)
+            return no_ids(), np.zeros(0)
+
+    late = offset_s != sequence.camera.depth_time_offset_s
+    return keyframe_motions(world, system.segments(), change if late else None)

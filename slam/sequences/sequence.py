@@ -92,7 +92,7 @@ class Sequence:
         """
         if not 0 <= index < len(self):
             raise InputError(f"{self.folder}: no frame {index}; there are 0 to {len(self) - 1}")
-        depth_m, lag_s = self._depth(index)
+        depth_m, lag_s = self.depth(index)
         return Frame(
             index,
             float(self.pairs.timestamps_s[index]),
@@ -106,10 +106,11 @@ class Sequence:
         """The same images, paired by another camera's ``depth_time_offset_s``."""
         return Sequence(self.recording, camera, self.config)
 
-    def _depth(self, index: int) -> tuple[Floats, float]:
-        """The depth, interpolated at the colour image's stamp where depth has a time offset.
+    def depth(self, index: int) -> tuple[Floats, float]:
+        """The depth (H, W) of a frame in metres, and its lag, as in `Frame`.
 
-        And its lag, as in `Frame`.
+        It is interpolated at the colour image's stamp where depth has a time offset. Raises
+        InputError for a broken image.
         """
         depth_m = self._read_depth(self.pairs.depth_files[index])
         other, offset_s = self.pairs.neighbour_files[index], self.camera.depth_time_offset_s

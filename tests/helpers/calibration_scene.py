@@ -67,11 +67,14 @@ def make_problem(
     start: Array | None = None,
     keyframes: int = 14,
     points: int = 150,
+    *,
+    still_from: int | None = None,
 ) -> tuple[CalibrationProblem, Array, Array]:
     """A problem that starts at ``start`` (18,), and its true poses and points.
 
     ``noise`` is a factor on sigmas of 0.3 px and 0.002 / m, which the problem states. Poses and
-    points start a little beside the truth, the first pose at it.
+    points start a little beside the truth, the first pose at it. From keyframe ``still_from`` on
+    the camera stands still while an image is taken.
     """
     rng = np.random.default_rng(seed)
     room = make_room(keyframes, points)
@@ -79,6 +82,7 @@ def make_problem(
     poses = room.poses_world_camera @ make_pose(roll, np.zeros((keyframes, 3)))
     poses[:, :3, 3] += rng.uniform(-0.5, 0.5, (keyframes, 3))
     velocities = rng.uniform(-1, 1, (keyframes, 6)) * [0.5, 0.5, 0.5, 0.6, 0.6, 0.6]
+    velocities[keyframes if still_from is None else still_from :] = 0.0
     k, point_ids = (i.ravel() for i in np.indices((keyframes, points)))
     points_camera = transform(inverse(poses), room.points_world)[k, point_ids]
     pixels = project(points_camera, truth)

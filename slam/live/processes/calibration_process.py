@@ -22,10 +22,10 @@ from bmask_slam.calibration.adoption import (
     judged,
 )
 from bmask_slam.calibration.keyframe_depth import KeptDepths, KeyframeDepth, KeyframeImages
-from bmask_slam.calibration.motion import twists_at
+from bmask_slam.calibration.keyframe_motions import keyframe_motions
 from bmask_slam.calibration.rematching import estimate_again
 from bmask_slam.calibration.views import sensor_sigmas
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array, Ints, no_ids
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
@@ -37,6 +37,7 @@ from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import STATE_FILE, CameraEstimated, EstimateCamera, Ready
 from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_state import world_of
 from bmask_slam.world.world_map import WorldMap
 
@@ -101,7 +102,7 @@ class CalibrationServer:
         state = replace(self._state, looks=self._state.looks + 1)
         try:
             reader = KeptDepths(kept, run.camera)
-            estimate = estimate_again(world, run, reader, config.min_change_s)
+            estimate = estimate_again(world, run, reader, setup.camera, config.min_change_s)
         except InputError as error:
             logger.info("calibration: %s", error)
             estimate = None
@@ -119,22 +120,19 @@ class CalibrationServer:
         self, world: WorldMap, paths: dict[int, Trajectory], run: SavedRun, camera: Camera
     ) -> dict[int, KeyframeMotion]:
         """By what the keyframes are to be interpreted anew, with another camera."""
-        table, motions = run.tables.observations, {}
-        retimed = camera.depth_time_offset_s != run.camera.depth_time_offset_s
-        for k in world.keyframes.values():
-            twist = twist_of(k.timestamp_s, paths.get(k.segment))
-            motions[k.id] = KeyframeMotion(twist)
-            depth = self._depths.get(k.id)
-            if not retimed or depth is None:
-                continue
-            seen = table.select(table.rows_of_keyframes([k.id]))
-            if not len(seen):
-                continue
-            known, keypoints = observed_by(world, k.id, seen.landmark_ids)
+        table, offset_s = run.tables.observations, camera.depth_time_offset_s
+
+        def change(keyframe: Keyframe) -> tuple[Ints, Array]:
+            depth = self._depths.get(keyframe.id)
+            seen = table.select(table.rows_of_keyframes([keyframe.id]))
+            if depth is None or not len(seen):
+                return no_ids(), np.zeros(0)
+            known, keypoints = observed_by(keyframe, seen.landmark_ids)
             sigmas = sensor_sigmas(seen, camera)[known]
-            change = depth.delay_correction(keypoints, sigmas, camera.depth_time_offset_s)
-            motions[k.id] = KeyframeMotion(twist, keypoints, change)
-        return motions
+            return keypoints, depth.delay_correction(keypoints, sigmas, offset_s)
+
+        retimed = offset_s != run.camera.depth_time_offset_s
+        return keyframe_motions(world, paths, change if retimed else None)
 
 
 def read_state(
@@ -161,16 +159,9 @@ def read_state(
     return run, world, paths
 
 
-def observed_by(world: WorldMap, keyframe_id: int, landmark_ids: Ints) -> tuple[Ints, Ints]:
+def observed_by(keyframe: Keyframe, landmark_ids: Ints) -> tuple[Ints, Ints]:
     """Which of the landmarks (N,) a keyframe observes, and the keypoints that do."""
-    own = world.keyframes[keyframe_id].landmark_ids
-    rows = np.flatnonzero(own >= 0)
-    _, known, at = np.intersect1d(landmark_ids, own[rows], return_indices=True)
+    rows = np.flatnonzero(keyframe.landmark_ids >= 0)
+    own = keyframe.landmark_ids[rows]
+    _, known, at = np.intersect1d(landmark_ids, own, return_indices=True)
     return known, rows[at]
-
-
-def twist_of(stamp_s: float, path: Trajectory | None) -> Array:
-    """The camera's velocity (6,) at a stamp; zero where it is not known."""
-    if path is None or not len(path):
-        return np.zeros(6)
-    return twists_at(path, np.array([stamp_s]))[0]

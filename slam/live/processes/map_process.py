@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from bmask_slam.back_end.reinterpretation import use_camera
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import read_arrays, write_arrays
@@ -180,9 +179,7 @@ class MapServer:
     def use_camera(self, message: UseCamera) -> None:
         """Go on with another camera, and send the map that was adjusted to it."""
         started_s = time.perf_counter()
-        system = self.system
-        system.camera = system.camera_tracker.tracker.camera = message.camera
-        use_camera(system.mapper, message.camera, message.motions)
+        self.system.use_camera(message.camera, message.motions)
         self.send_changes(-1, done=False)
         ms, count = 1e3 * (time.perf_counter() - started_s), len(message.motions)
         logger.info("camera: %d keyframes interpreted anew in %.0f ms", count, ms)

@@ -7,7 +7,7 @@ import json
 import shutil
 import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from bmask_slam.calibration.adoption import (
     camera_with,
     format_found,
     judged,
-    newly_sure,
+    surely_other,
 )
 from bmask_slam.calibration.camera_check import CameraCheck
 from bmask_slam.calibration.priors import estimated_priors
@@ -37,15 +37,18 @@ from bmask_slam.graph.calibration.model import BEND, LENS, PARAMETERS, SHUTTER, 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.labelling.mask_memory import MaskMemory, RememberingSegmenter
-from bmask_slam.offline import checkpoint, frame_loop, runner
+from bmask_slam.offline import checkpoint, frame_loop, run_end, runner
 from bmask_slam.offline.runner import RunOptions, RunSummary, resume, run
 from bmask_slam.offline.self_calibration import SelfCalibrator
+from bmask_slam.parallel.system import ParallelSystems
 from bmask_slam.run_folder.map_file import read_run
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.sequences.cameras import read_camera
+from bmask_slam.sequences.sequence import Sequence, open_sequence
+from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 
 CONFIG = resolve(
@@ -61,7 +64,7 @@ KILLED = (5, 7)
 def short_ends() -> Iterator[None]:
     """Ends runs without the picture and the check of the camera, which are tested elsewhere."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(frame_loop, "_camera_checked", lambda _: CameraCheck((), (), ()))
+        patch.setattr(run_end, "_camera_checked", lambda _: CameraCheck((), (), ()))
         patch.setattr(plot, "plot_trajectory", lambda path, *_: path.write_text("quick"))
         yield
 
@@ -201,28 +204,108 @@ def test_both_halves_have_to_find_what_is_adopted(
 
 @pytest.mark.parametrize(
     ("gains", "asked", "adopted"),
-    [((3.0, -9.0), [2], True), ((-1.0, 3.0), [2, 4], True), ((1.0, 1.0), [2, 4], False)],
+    [((3.0,), 1, True), ((-1.0, 3.0), 2, True), ((1.0, 1.0), 2, False)],
 )
-def test_quarters_are_asked_where_halves_prove_nothing(
-    monkeypatch: pytest.MonkeyPatch, gains: tuple[float, float], asked: list[int], adopted: bool
+def test_every_second_keyframe_is_asked_where_halves_in_time_prove_nothing(
+    monkeypatch: pytest.MonkeyPatch, gains: tuple[float, ...], asked: int, adopted: bool
 ) -> None:
-    """Of 26 +- 0.5 ms found for a camera without readout time."""
-    found = np.where(np.arange(18) == SHUTTER, 0.026, 0.0)
-    sigmas = np.where(np.arange(18) == SHUTTER, 0.0005, 0.0)
-    estimate = Estimate(np.zeros(18), found, sigmas, None)  # type: ignore[arg-type]
-    parts_asked: list[int] = []
+    """Of 26 +- 0.5 ms found for a camera without readout time; gains in standard errors."""
+    calls = prove(monkeypatch, *gains)
+    sure = surely_other(_times(readout_ms=26.0), SelfCalibrationConfig())
+    assert calls == [False, True][:asked] and sure == ([SHUTTER] if adopted else [])
 
-    def proof(_: object, judged: tuple[int, ...], parts: int) -> CrossValidation:
+
+def prove(monkeypatch: pytest.MonkeyPatch, *gains_sigmas: float) -> list[bool]:
+    """Halves agree with every estimate, and gain so much in each way. Returns the ways asked."""
+    asked: list[bool] = []
+
+    def proof(problem: Estimate, judged: tuple[int, ...], alternately: bool) -> CrossValidation:
         assert judged == FREE
-        parts_asked.append(parts)
-        mean = gains[len(parts_asked) - 1]
+        asked.append(alternately)
+        gain = gains_sigmas[len(asked) - 1]
         return CrossValidation(
-            np.tile(found, (parts, 1)), np.full((parts, 18), 0.001), mean + np.array([-1.0, 1.0])
+            np.zeros((2, 18)), np.full((2, 18), 0.1), gain + np.array([-1.0, 1.0])
         )
 
     monkeypatch.setattr("bmask_slam.calibration.adoption.cross_validate", proof)
-    sure = newly_sure(estimate, FREE, SelfCalibrationConfig())
-    assert parts_asked == asked and sure == ([SHUTTER] if adopted else [])
+    return asked
+
+
+def _times(readout_ms: float, delay_ms: float = 0.0) -> Estimate:
+    """An estimate, with sigmas of .5 ms, of a camera given without readout time and delay."""
+    found, sigmas = np.zeros(18), np.zeros(18)
+    found[[SHUTTER, TIME]] = 1e-3 * readout_ms, 1e-3 * delay_ms
+    sigmas[[SHUTTER, TIME]] = 0.0005
+    return Estimate(np.zeros(18), found, sigmas, None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("readout_ms", "delay_ms", "gain", "then_s"),
+    [
+        (21.4, 0.3, 3.0, (0.020, 0.0)),  # as before, within its bounds
+        (25.0, 0.3, 3.0, (0.025, 0.0)),  # another value of what was adopted
+        (20.9, -15.0, 3.0, (0.0209, -0.015)),  # the delay too
+        (25.0, -15.0, 1.0, (0.020, 0.0)),  # not proved
+    ],
+)
+def test_the_last_look_replaces_what_was_adopted(
+    monkeypatch: pytest.MonkeyPatch,
+    readout_ms: float,
+    delay_ms: float,
+    gain: float,
+    then_s: tuple[float, float],
+) -> None:
+    """Of a camera for which 20 ms were adopted at the first look."""
+    prove(monkeypatch, gain, gain)
+    camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+    first = replace(camera, rolling_shutter_s=0.020)
+    before = SelfCalibration(camera, first, "20 ms: found and applied", settled=True)
+    after = judged(before, _times(readout_ms, delay_ms), "auto", SelfCalibrationConfig())
+    assert (after.camera.rolling_shutter_s, after.camera.depth_time_offset_s) == then_s
+    assert after.given == camera
+    if after.camera == first:
+        assert after == before
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_after_the_last_frame_keyframes_get_the_depth_of_the_camera_found(
+    late_sweep: Path, sweep_camera: Camera, parallel: bool
+) -> None:
+    """A run that has adopted a third of the delay looks back; no frame is tracked again."""
+    given, delay_s = read_camera(late_sweep / "camera.yaml"), sweep_camera.depth_time_offset_s
+    third = replace(given, depth_time_offset_s=delay_s / 3)
+    sequence, right = open_sequence(late_sweep, camera=third), open_sequence(late_sweep)
+    right = right.with_camera(sweep_camera)
+    with closing(ParallelSystems(CONFIG.semantics.segmenter, late_sweep)) as systems:
+        system = systems(third, CONFIG) if parallel else SlamSystem(third, CONFIG)
+        for frame in sequence.frames(0, FRAMES):
+            system.process(frame)
+        before_m = _depth_error_m(system, right)
+        state = SelfCalibration(given, third, "a third", settled=True)
+        calibrator = SelfCalibrator(state, "auto")
+        assert not SelfCalibrator(state, "off").look_back(system, sequence)
+        assert calibrator.look_back(system, sequence)
+        assert not calibrator.look_back(system, sequence.with_camera(system.camera))
+        text = system.events.take()[-1].text
+        system.finish()
+    camera = calibrator.state.camera
+    assert system.mapper.camera == system.camera == camera
+    assert camera.depth_time_offset_s == pytest.approx(delay_s, abs=0.003)
+    assert text == calibrator.state.text and "colour-depth delay" in text
+    assert _depth_error_m(system, right) < 0.5 * before_m
+
+
+def _depth_error_m(system: SlamSystem, right: Sequence) -> float:
+    """Root mean square, of points that the graph observes, against frames of the right camera."""
+    errors = []
+    for keyframe in system.mapper.world.keyframes.values():
+        index = int(np.argmin(np.abs(right.timestamps_s - keyframe.timestamp_s)))
+        exact = system.prepare(right.load(index))
+        n = len(exact.depth_m)  # what optical flow found comes behind
+        observed = keyframe.landmark_ids[:n] >= 0
+        errors.append((keyframe.features.depth_m[:n] - exact.depth_m)[observed])
+    together = np.concatenate(errors)
+    return float(np.sqrt(np.nanmean(together**2)))
 
 
 @pytest.mark.parametrize(

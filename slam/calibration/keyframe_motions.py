@@ -1,0 +1,68 @@
+"""By what a map's keyframes are interpreted anew with a camera that was found.
+
+Their rows were exposed one after the other, and their depth images some time before or after: with
+another readout time or delay, keypoints and depths move by the camera's velocity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from bmask_slam.back_end.reinterpretation import KeyframeMotion
+from bmask_slam.calibration.motion import twists_at
+from bmask_slam.calibration.views import MAX_LATE_S
+from bmask_slam.features.brisk import FeatureConfig, sample_depth
+from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.trajectory import Trajectory, nearest_indices
+from bmask_slam.sequences.sequence import Sequence
+from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
+
+DepthChange = Callable[[Keyframe], tuple[Ints, Array]]
+"""Keypoints (N,) of a keyframe, and what to add to their inverse depths (N,) in 1/m."""
+
+
+def keyframe_motions(
+    world: WorldMap, paths: Mapping[int, Trajectory], depth_change: DepthChange | None
+) -> dict[int, KeyframeMotion]:
+    """The motion of every keyframe, by id.
+
+    ``paths`` has the trajectory of each segment; ``depth_change`` is None if the delay of depth is
+    the old one.
+    """
+    motions = {}
+    for k in world.keyframes.values():
+        twist = _twist_of(k.timestamp_s, paths.get(k.segment))
+        motions[k.id] = KeyframeMotion(twist, *(depth_change(k) if depth_change else ()))
+    return motions
+
+
+def _twist_of(stamp_s: float, path: Trajectory | None) -> Array:
+    """The camera's velocity (6,) at a stamp; zero where it is not known."""
+    if path is None or not len(path):
+        return np.zeros(6)
+    return twists_at(path, np.array([stamp_s]))[0]
+
+
+def depth_change_between(
+    before: Sequence, after: Sequence, keyframe: Keyframe, config: FeatureConfig
+) -> tuple[Ints, Array]:
+    """What another delay does to a keyframe's depths, by its images; 0 where either has none.
+
+    The sequences are the same images with either delay. Raises InputError for a broken image.
+    """
+    pixels, stamp_s = keyframe.features.image_pixels, keyframe.timestamp_s
+    old, new = (_inverse_depth(images, stamp_s, pixels, config) for images in (before, after))
+    return np.arange(len(pixels)), np.nan_to_num(new - old)
+
+
+def _inverse_depth(
+    sequence: Sequence, stamp_s: float, pixels: Array, config: FeatureConfig
+) -> Array:
+    """As tracking measures it, in 1/m (N,) at raw pixels (N, 2); NaN if there is no such frame."""
+    index = int(nearest_indices(sequence.timestamps_s, np.array([stamp_s]))[0])
+    if abs(sequence.timestamps_s[index] - stamp_s) > MAX_LATE_S:
+        return np.full(len(pixels), np.nan)
+    return 1.0 / sample_depth(sequence.depth(index)[0], pixels, config)[0]
