@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ from bmask_slam.calibration.priors import estimated_priors
 from bmask_slam.calibration.report import parameters_named
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import plot
+from bmask_slam.events import EventKind
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.calibration.cross_validation import CrossValidation
 from bmask_slam.graph.calibration.model import BEND, LENS, PARAMETERS, SHUTTER, TIME
@@ -293,6 +295,31 @@ def test_after_the_last_frame_keyframes_get_the_depth_of_the_camera_found(
     assert camera.depth_time_offset_s == pytest.approx(delay_s, abs=0.003)
     assert text == calibrator.state.text and "colour-depth delay" in text
     assert _depth_error_m(system, right) < 0.5 * before_m
+
+
+def test_a_run_keeps_the_camera_that_its_last_look_finds(
+    late_sweep: Path,
+    sweep_camera: Camera,
+    quick: None,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    """Its first look adopts a third of the delay."""
+    third_s = sweep_camera.depth_time_offset_s / 3
+
+    def first(state: SelfCalibration, *rest: Any) -> SelfCalibration:
+        if state.adopted:
+            return judged(state, *rest)
+        camera = replace(state.given, depth_time_offset_s=third_s)
+        return replace(state, camera=camera, text="a third: found and applied", settled=True)
+
+    monkeypatch.setattr("bmask_slam.offline.self_calibration.judged", first)
+    summary = run(replace(late_options(late_sweep, tmp_path / "run"), checkpoint_every=None))
+    camera = read_camera(summary.folder / "camera.yaml")
+    assert camera.depth_time_offset_s == pytest.approx(sweep_camera.depth_time_offset_s, abs=0.003)
+    assert read_run(summary.folder).camera == camera
+    texts = [e.text for e in Run(summary.folder).events if e.kind is EventKind.CALIBRATION]
+    assert texts == ["a third: found and applied", summary.calibration]
 
 
 def _depth_error_m(system: SlamSystem, right: Sequence) -> float:
