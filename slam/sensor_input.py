@@ -101,7 +101,7 @@ class SensorInput(ABC):
 class SensorSystem(SystemResults, SensorInput):
     """A system with its map and graph in this process, which takes measurements and factors.
 
-    It can go on with another camera too, which its frames' depth images follow.
+    It can also go on with another camera, to which the keyframes of the map are adapted.
     """
 
     camera_tracker: CameraTracker

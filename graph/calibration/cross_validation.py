@@ -1,4 +1,4 @@
-"""Whether a calibration fits observations that it was not estimated from, and agrees in parts.
+"""Whether a calibration fits observations that it was not estimated from, and agrees in halves.
 
 The keyframes are split into two halves. The calibration is estimated from each; then poses and
 points of the other half are fitted with it and, for comparison, with the one that was there before.
@@ -61,13 +61,14 @@ def cross_validate(
     Parameters that are free but not among those ``judged``, by their places in PARAMETERS, are
     fitted to the half that judges, with what was there before and with what was found.
     """
-    halves = halves_of(problem, alternately)
-    found, gains = [], []
-    for own, judge in (halves, halves[::-1]):
-        if own is None or judge is None:
-            return None
-        found.append(calibrate(own, QUICK))
-        gains.append(_gains(judge, found[-1], list(judged)))
+    first, second = halves_of(problem, alternately)
+    if first is None or second is None:
+        return None
+    found = [calibrate(half, QUICK) for half in (first, second)]
+    gains = [
+        _gains(judge, result, list(judged))
+        for judge, result in zip((second, first), found, strict=True)
+    ]
     return CrossValidation(
         np.array([result.calibration for result in found]),
         np.array([np.sqrt(np.diag(result.covariance)) for result in found]),
@@ -83,8 +84,8 @@ def halves_of(
     Or of every second keyframe, ``alternately``.
     """
     count = len(problem.poses_world_camera)
-    last = np.arange(count) % 2 == 1 if alternately else np.arange(count) >= count // 2
-    return _part_of(problem, ~last), _part_of(problem, last)
+    second = np.arange(count) % 2 == 1 if alternately else np.arange(count) >= count // 2
+    return _part_of(problem, ~second), _part_of(problem, second)
 
 
 def _part_of(problem: CalibrationProblem, keyframes: Mask) -> CalibrationProblem | None:

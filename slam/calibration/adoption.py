@@ -131,12 +131,12 @@ class Estimate:
         By the limits of ``differs``.
         """
         change = self.found - parameters_of(camera, camera.depth_scale)
-        apart = [(i, abs(change[i]), self.sigmas[i], config.min_change_s) for i in TIMES]
-        bend = _rms(change[BEND]), _rms_sigma(self.sigmas[BEND])
-        apart.append((BENDS[0], *bend, config.min_bend))
+        steps = {i: (abs(change[i]), self.sigmas[i]) for i in TIMES}
+        steps[BENDS[0]] = _rms(change[BEND]), _rms_sigma(self.sigmas[BEND])
         return any(
-            self.shows(i, config) and step > max(config.min_change_sigmas * sigma, least)
-            for i, step, sigma, least in apart
+            self.shows(i, config)
+            and step > max(config.min_change_sigmas * sigma, config.limits(i)[1])
+            for i, (step, sigma) in steps.items()
         )
 
     def shows(self, i: int, config: SelfCalibrationConfig) -> bool:
@@ -159,9 +159,9 @@ class Estimate:
         found, sigma = self.found[BEND], _rms_sigma(self.sigmas[BEND])
         nearer = _rms(found - self.before[BEND]) / 2
         return all(
-            _rms(other[BEND] - found)
+            _rms(half[BEND] - found)
             <= max(nearer, config.min_change_sigmas * np.hypot(_rms_sigma(sigmas[BEND]), sigma))
-            for other, sigmas in zip(halves.calibrations, halves.sigmas, strict=True)
+            for half, sigmas in zip(halves.calibrations, halves.sigmas, strict=True)
         )
 
 

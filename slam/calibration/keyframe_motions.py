@@ -12,10 +12,10 @@ import numpy as np
 
 from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.calibration.motion import twists_at
-from bmask_slam.calibration.views import MAX_LATE_S
+from bmask_slam.calibration.views import frames_of
 from bmask_slam.features.brisk import FeatureConfig, sample_depth
 from bmask_slam.graph.arrays import Array, Ints
-from bmask_slam.graph.trajectory import Trajectory, nearest_indices
+from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
@@ -53,16 +53,14 @@ def depth_change_between(
 
     The sequences are the same images with either delay. Raises InputError for a broken image.
     """
-    pixels, stamp_s = keyframe.features.image_pixels, keyframe.timestamp_s
-    old, new = (_inverse_depth(images, stamp_s, pixels, config) for images in (before, after))
-    return np.arange(len(pixels)), np.nan_to_num(new - old)
+    old, new = (_inverse_depth(images, keyframe, config) for images in (before, after))
+    return np.arange(len(old)), np.nan_to_num(new - old)
 
 
-def _inverse_depth(
-    sequence: Sequence, stamp_s: float, pixels: Array, config: FeatureConfig
-) -> Array:
-    """As tracking measures it, in 1/m (N,) at raw pixels (N, 2); NaN if there is no such frame."""
-    index = int(nearest_indices(sequence.timestamps_s, np.array([stamp_s]))[0])
-    if abs(sequence.timestamps_s[index] - stamp_s) > MAX_LATE_S:
+def _inverse_depth(sequence: Sequence, keyframe: Keyframe, config: FeatureConfig) -> Array:
+    """As tracking measures it at keypoints, in 1/m (N,); NaN if the sequence has no such frame."""
+    pixels = keyframe.features.image_pixels
+    frames = frames_of({keyframe.id: keyframe.timestamp_s}, sequence)
+    if keyframe.id not in frames:
         return np.full(len(pixels), np.nan)
-    return 1.0 / sample_depth(sequence.depth(index)[0], pixels, config)[0]
+    return 1.0 / sample_depth(sequence.depth(frames[keyframe.id])[0], pixels, config)[0]

@@ -189,6 +189,15 @@ class DepthReader(Protocol):
         """
 
 
+def frames_of(stamps_s: dict[int, float], sequence: Sequence) -> dict[int, int]:
+    """The frames of a sequence with these stamps, by the same keys; others are left out."""
+    known = {k: s for k, s in stamps_s.items() if np.isfinite(s)}
+    at = nearest_indices(sequence.timestamps_s, np.array(list(known.values())))
+    near = np.abs(sequence.timestamps_s[at] - np.array(list(known.values()))) < MAX_LATE_S
+    pairs = zip(known, at.tolist(), near, strict=True)
+    return {k: index for k, index, ok in pairs if ok}
+
+
 class SequenceDepths:
     """The depth images of keyframes in a sequence.
 
@@ -197,12 +206,7 @@ class SequenceDepths:
     """
 
     def __init__(self, stamps_s: dict[int, float], sequence: Sequence) -> None:
-        self.sequence = sequence
-        known = {k: s for k, s in stamps_s.items() if np.isfinite(s)}
-        at = nearest_indices(sequence.timestamps_s, np.array(list(known.values())))
-        near = np.abs(sequence.timestamps_s[at] - np.array(list(known.values()))) < MAX_LATE_S
-        pairs = zip(known, at.tolist(), near, strict=True)
-        self._frames = {k: index for k, index, ok in pairs if ok}
+        self.sequence, self._frames = sequence, frames_of(stamps_s, sequence)
 
     @property
     def keyframe_ids(self) -> Ints:

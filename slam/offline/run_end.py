@@ -80,9 +80,9 @@ def finish_run(run: ActiveRun) -> RunSummary:
 
 
 def _look_back(run: ActiveRun) -> None:
-    """Let the calibrator look at the whole run; a dense map that it has is of another camera then.
+    """Let the calibrator look at the whole run.
 
-    Dense maps on the way are made again.
+    If it finds another camera, a dense map that was made on the way is removed, to be made again.
     """
     if run.calibrator.look_back(run.system, run.sequence):
         run.sequence = run.sequence.with_camera(run.calibrator.state.camera)

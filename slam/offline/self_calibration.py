@@ -109,7 +109,6 @@ class SelfCalibrator:
         camera = self.state.camera
         if camera == before.camera:
             return False
-        logger.info("calibration: by all frames: %s", self.state.text)
         system.events.calibration(self.state.text)
         system.use_camera(camera, _motions(system, sequence, camera))
         return True
