@@ -16,6 +16,7 @@ from bmask_slam.graph.geometry import quaternion_from_rotation
 from bmask_slam.graph.sensors.streams import Measurements, measurements
 from bmask_slam.system_results import SystemResults
 from bmask_slam.tracking.camera_tracker import CameraTracker
+from bmask_slam.world.frame_observations import FrameObservations
 
 
 class SensorInput(ABC):
@@ -105,6 +106,7 @@ class SensorSystem(SystemResults, SensorInput):
     """
 
     camera_tracker: CameraTracker
+    frame_observations: FrameObservations
 
     def add_measurements(self, new: Measurements) -> None:
         """Use the measurements of a sensor beside the camera."""
@@ -123,6 +125,7 @@ class SensorSystem(SystemResults, SensorInput):
     def use_camera(self, camera: Camera, motions: Mapping[int, KeyframeMotion]) -> None:
         """Go on with another camera; keyframes of known motion are interpreted anew by it."""
         self.camera = self.camera_tracker.tracker.camera = camera
+        self.frame_observations.clear()  # made with the other camera
         use_camera(self.mapper, camera, motions)
 
     def _change_factors(self, added: list[tuple[int, Any]], removed: tuple[int, ...]) -> None:

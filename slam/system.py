@@ -4,38 +4,37 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
-
+from bmask_slam.back_end.factors import stereo_measurements
+from bmask_slam.back_end.frame_adjustment import adjust_with_frames
 from bmask_slam.back_end.map_backend import MapBackend
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.back_end.marker_loops import join_by_markers
 from bmask_slam.back_end.segment_joining import can_join
 from bmask_slam.features.brisk import BriskExtractor, Features
 from bmask_slam.features.marker_detection import MarkerDetector
-from bmask_slam.graph.arrays import Array, Arrays, Ints
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.files.array_file import fitting, nested, part
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.moving.moving_object_filter import MovingObjectFilter
 from bmask_slam.moving.static_features import StaticFeatures
 from bmask_slam.runtime.stage_clock import stage
 from bmask_slam.semantics.segmenters.segmenter import Segmenter, begin_early
-from bmask_slam.sensor_input import SensorSystem
 from bmask_slam.sequences.frame import Frame, check_frame
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.system_results import checked_state, largest
+from bmask_slam.system_results import largest
+from bmask_slam.system_state import SavedSystem
 from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.keyframe_decision import KeyframeDecision
 from bmask_slam.tracking.results import FrameResult, Tracked, TrackingStatus
 from bmask_slam.tracking.tracker import Tracker
+from bmask_slam.world.frame_observations import FrameObservations
 from bmask_slam.world.keyframe import Keyframe
 
 logger = logging.getLogger(__name__)
 
 
-class SlamSystem(SensorSystem):
+class SlamSystem(SavedSystem):
     """RGB-D frames in, poses out; the map and the graph grow on the way.
 
     Attributes:
@@ -45,6 +44,7 @@ class SlamSystem(SensorSystem):
         moving_objects: keeps what moves out of tracking and out of the map.
         keyframes: decides which frames stay in the map.
         semantics: labels landmarks and finds objects.
+        frame_observations: what tracked frames that are no keyframes observe.
         markers: finds fiducial markers in keyframes; None where they are not looked for.
         stage_ms: wall time of each stage of the last frame, in milliseconds.
     """
@@ -78,6 +78,7 @@ class SlamSystem(SensorSystem):
         markers = config.sensors.markers
         self.markers = MarkerDetector(markers, config.features) if markers.enabled else None
         self.stage_ms: dict[str, float] = {}
+        self.frame_observations = FrameObservations()
         self._first_keyframe = 0  # of this session
 
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
@@ -134,6 +135,7 @@ class SlamSystem(SensorSystem):
         """The last optimisation; the map is then final."""
         if self.config.final_adjustment:
             self.mapper.finish()
+            self._adjust_frames()
         if self.config.smooth_trajectory:
             self.map.history.smooth(self.map.world)
         known = self.map.world.in_segment(largest(self.segments()))
@@ -142,56 +144,10 @@ class SlamSystem(SensorSystem):
                 "no frame was recognised in the map: the trajectory has its own coordinate frame"
             )
 
-    def state(self) -> Arrays:
-        """All that the system has learned, as named arrays."""
-        return {
-            **self._progress(),
-            **nested(
-                mapper=self.mapper.state(),
-                localiser=self.camera_tracker.state(),
-                semantics=self.semantics.state(),
-                dynamics=self.moving_objects.state(),
-            ),
-        }
-
-    def restore(self, state: Arrays, path: Path) -> None:
-        """Become the system of a state that was read from a file. Raises InputError."""
-        state = checked_state(state, self.state(), path)
-        with fitting(path):
-            self.mapper.restore(part(state, "mapper"), path)
-            self.camera_tracker.restore(part(state, "localiser"))
-            self.semantics.restore(part(state, "semantics"), path)
-            self.moving_objects.restore(part(state, "dynamics"))
-        self._restore_progress(state)
-
-    def _progress(self) -> Arrays:
-        """Where in the map tracking is, and since when."""
-        reference = self.camera_tracker.reference
-        return {
-            "segment": np.array(self.camera_tracker.segment),
-            "reference": np.array(-1 if reference is None else reference.id),
-            "frames_since_keyframe": np.array(self.keyframes.frames_since),
-            "first_keyframe": np.array(self._first_keyframe),
-        }
-
-    def _restore_progress(self, state: Arrays) -> None:
-        self.camera_tracker.segment = int(state["segment"])
-        self.camera_tracker.reference = self.map.world.keyframes.get(int(state["reference"]))
-        self.keyframes.frames_since = int(state["frames_since_keyframe"])
-        self._first_keyframe = int(state["first_keyframe"])
-
-    def restart(self) -> None:
-        """Rebuild what a state cannot hold: from here on the system goes on like a restored one."""
-        self.mapper.restart()
-
-    def begin_session(self) -> None:
-        """Go on with the map in another recording; nothing else is kept."""
-        self.keyframes.frames_since = 0
-        self._first_keyframe = self.map.world.next_keyframe_id
-        self.mapper.begin_session()
-        self.semantics.begin_session()
-        self.moving_objects.begin_session()
-        self.camera_tracker.begin_session()
+    def _adjust_frames(self) -> None:
+        """Adjust the whole map again with what other frames observe."""
+        if self.config.adjust_frames:
+            adjust_with_frames(self.mapper, self.frame_observations, self.config.graph)
 
     def _begin(self, frame: Frame) -> Frame:
         frame = check_frame(frame, self.camera, self.camera_tracker.timestamp_s)
@@ -295,6 +251,10 @@ class SlamSystem(SensorSystem):
         if keyframe or tracked.status.by_image:
             self.camera_tracker.remember(tracked.features, landmark_of, T_world_camera)
             self.camera_tracker.update_motion(tracked.T_world_camera, T_world_camera, ids)
+        if not keyframe and tracked.status.by_image:
+            keypoints, features = tracked.keypoints, tracked.features
+            measured = stereo_measurements(features, keypoints), features.sigmas_px[keypoints]
+            self.frame_observations.append(frame.timestamp_s, tracked.landmark_ids, *measured)
         poses = reference.T_world_camera, T_world_camera
         self.map.history.append(frame.timestamp_s, reference.id, *poses, tracked.information)
         return T_world_camera

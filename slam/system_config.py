@@ -22,7 +22,8 @@ from bmask_slam.tracking.tracker import TrackingConfig
 class SystemConfig:
     """All settings; YAML files hold only what differs from these defaults.
 
-    ``final_adjustment``: a full bundle adjustment ends the run. ``smooth_trajectory``: then the
+    ``final_adjustment``: a full bundle adjustment ends the run. ``adjust_frames``: then the map is
+    adjusted again, together with the frames that are no keyframes. ``smooth_trajectory``: then the
     poses of all frames are smoothed by the camera's inertia. ``covariances``: those of all
     keyframes are written with its results.
     """
@@ -39,6 +40,7 @@ class SystemConfig:
     semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
     moving_objects: MovingObjectConfig = field(default_factory=MovingObjectConfig)
     final_adjustment: bool = True
+    adjust_frames: bool = True
     smooth_trajectory: bool = True
     covariances: bool = False
 

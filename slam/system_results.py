@@ -41,6 +41,7 @@ NEWER_ARRAYS = (
     "mapper.loops.drift.",
     "mapper.loops.recogniser.dismissed",
     "localiser.images.",
+    "frames.",
     "semantics.surfaces.",
 )
 """Beginnings of the names of arrays that older files lack; an empty system's are used then."""

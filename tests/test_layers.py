@@ -36,8 +36,8 @@ ROOMS = {
     "mapping": "[...]  inverse_depth  surface  products",
     "slam": """events  evaluation  config  sequences  features  world  rendering  datasets
                tracking  loops  moving  runtime  sensing  back_end  labelling  system_config
-               system_interface  run_folder  system_results  sensor_input  system  dense
-               calibration  refinement  viewer  live  parallel  offline  merging  reporting
+               system_interface  run_folder  system_results  sensor_input  system_state  system
+               dense  calibration  refinement  viewer  live  parallel  offline  merging  reporting
                comparison  api  doctor  commands  cli  job_process  __init__  __main__""",
     "slam/sequences": "[...]  bags  formats  sequence  info  right_images  __init__",
     "slam/run_folder": "[...]  scene  export",

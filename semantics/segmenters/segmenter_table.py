@@ -178,6 +178,14 @@ def _network(options: SegmenterOptions, find_weights: FindWeights) -> Segmenter:
     return NetworkSegmenter(other, options.min_score, detector)
 
 
+class LabelsOnly(NoSegmenter):
+    """No segmenter, but the labels of one: masks come from another process."""
+
+    def __init__(self, names: tuple[str, ...], options: SegmenterOptions) -> None:
+        self.labels = LabelSet(names)
+        self.measured = measured_name(options)
+
+
 def needed_by(options: SegmenterOptions) -> tuple[str, str, str, str]:
     """What a network needs, as arguments of `graph.extras.import_extra`."""
     instead = "take --segmenter none: no labels, objects or masks"

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bmask_slam.graph.arrays import Array, Floats, Image, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Image, Ints
 from bmask_slam.graph.files.array_file import FileKind
 
 if TYPE_CHECKING:  # a process loads what its own messages hold
@@ -213,10 +213,14 @@ class SaveMap:
 
 @dataclass(frozen=True, eq=False)
 class Finish:
-    """To the map: no more keyframes; optimise a last time and write the state to a file."""
+    """To the map: no more keyframes; optimise a last time and write the state to a file.
+
+    ``frames``: the state of `FrameObservations`, if frames are adjusted too.
+    """
 
     path: Path
     history: Entries
+    frames: Arrays = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,14 +20,7 @@ from bmask_slam.graph.files.array_file import nested, read_arrays
 from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.labelling.results import LandmarkLabels
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
-from bmask_slam.live.messages import (
-    STATE_FILE,
-    ChangeOwnFactors,
-    ImageToSegment,
-    Masks,
-    UseCamera,
-)
-from bmask_slam.live.processes.map_process import LabelsOnly
+from bmask_slam.live.messages import STATE_FILE, ChangeOwnFactors, ImageToSegment, Masks, UseCamera
 from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.processes.remote_calibration import RemoteCalibration
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
@@ -35,6 +28,7 @@ from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.runtime.memory import short_pauses
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
+from bmask_slam.semantics.segmenters.segmenter_table import LabelsOnly
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
@@ -135,6 +129,7 @@ class LiveSystem(SlamSystem):
     def use_camera(self, camera: Camera, motions: Mapping[int, KeyframeMotion]) -> None:
         """Track with another camera from the next frame on, and tell the map."""
         self.camera = self.camera_tracker.tracker.camera = camera
+        self.frame_observations.clear()
         self.remote.send(UseCamera(camera, dict(motions)))
 
     def add_measurements(self, new: Measurements) -> None:
@@ -257,7 +252,7 @@ class LiveSystem(SlamSystem):
             time.sleep(0.02)
             self.catch_up()
         self.catch_up()
-        path = self.remote.finish(FINISH_S)
+        path = self.remote.finish(FINISH_S, self.frame_observations.state())
         state = read_arrays(path, STATE_FILE)[1]
         own = nested(dynamics=self.moving_objects.state())
         labels = LabelsOnly(self.label_names, self.config.semantics.segmenter)

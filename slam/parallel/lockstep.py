@@ -153,10 +153,10 @@ class LockstepMapper(RemoteMapper):
             if self.worker.has_crashed or time.monotonic() > until_s:
                 raise InputError(f"{path}: the map's process cannot go on from it")
 
-    def finish(self, timeout_s: float) -> Path:
+    def finish(self, timeout_s: float, frames: Arrays) -> Path:
         """As ``RemoteMapper.finish``."""
         self._finishes = True
-        return super().finish(timeout_s)
+        return super().finish(timeout_s, frames)
 
 
 class LockstepSegmenter(RemoteSegmenter):

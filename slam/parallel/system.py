@@ -12,11 +12,10 @@ from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import nested, part, read_arrays, write_arrays
 from bmask_slam.live.messages import STATE_FILE
-from bmask_slam.live.processes.map_process import LabelsOnly
 from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.system import LiveSystem
 from bmask_slam.parallel.lockstep import LockstepMapper, LockstepSegmenter
-from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+from bmask_slam.semantics.segmenters.segmenter_table import LabelsOnly, SegmenterOptions
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
@@ -78,7 +77,11 @@ class ParallelSystem(LiveSystem):
             **self._whole[1],
             **self._progress(),
             "mapper.events.now": self.events.state()["now"],
-            **nested(localiser=self.camera_tracker.state(), dynamics=self.moving_objects.state()),
+            **nested(
+                localiser=self.camera_tracker.state(),
+                dynamics=self.moving_objects.state(),
+                frames=self.frame_observations.state(),
+            ),
         }
 
     def restore(self, state: Arrays, path: Path) -> None:
@@ -87,6 +90,7 @@ class ParallelSystem(LiveSystem):
         self._begin_with(state)
         self.camera_tracker.restore(part(state, "localiser"))
         self.moving_objects.restore(part(state, "dynamics"))
+        self.frame_observations.restore(part(state, "frames"))
 
     def restart(self) -> None:
         """Go on with a new process and a new copy of the map, as a restored system does."""

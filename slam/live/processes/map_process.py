@@ -51,9 +51,7 @@ from bmask_slam.live.messages import (
 )
 from bmask_slam.live.replica import DeltaMaker
 from bmask_slam.runtime.memory import give_back_memory
-from bmask_slam.semantics.labels import LabelSet
-from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
-from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, measured_name
+from bmask_slam.semantics.segmenters.segmenter_table import LabelsOnly
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
@@ -64,14 +62,6 @@ logger = logging.getLogger(__name__)
 
 NICENESS = 5
 """Tracking has priority where there are too few cores."""
-
-
-class LabelsOnly(NoSegmenter):
-    """No segmenter, but the labels of one: masks come from another process."""
-
-    def __init__(self, names: tuple[str, ...], options: SegmenterOptions) -> None:
-        self.labels = LabelSet(names)
-        self.measured = measured_name(options)
 
 
 def serve_map(
@@ -140,13 +130,19 @@ class MapServer:
             case FramesTracked():
                 self._add_frames(message)
             case Finish():
-                self.system.mapper.history.extend(message.history)
-                self.system.finish()
-                self._write(message.path)
-                self._send(StateSaved(number, message.path))
+                self.finish(number, message)
             case _:
                 raise TypeError(f"not a message for the map: {message!r}")
         self._send(Handled(number))
+
+    def finish(self, number: int, message: Finish) -> None:
+        """Optimise a last time, and save the state."""
+        self.system.mapper.history.extend(message.history)
+        if message.frames:
+            self.system.frame_observations.restore(message.frames)
+        self.system.finish()
+        self._write(message.path)
+        self._send(StateSaved(number, message.path))
 
     def take_from_user(self, message: AddMeasurements | ChangeOwnFactors) -> None:
         """Measurements, or changes of a user's factors; one that cannot enter is reported."""

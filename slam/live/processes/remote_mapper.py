@@ -11,7 +11,7 @@ import numpy as np
 from bmask_slam.back_end.map_backend import add_keyframe
 from bmask_slam.events import Event, EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex
-from bmask_slam.graph.arrays import Ints, Mask
+from bmask_slam.graph.arrays import Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse
@@ -228,8 +228,10 @@ class RemoteMapper:
             others += self.catch_up(min(left_s, 0.05))
         return others
 
-    def finish(self, timeout_s: float) -> Path:
+    def finish(self, timeout_s: float, frames: Arrays) -> Path:
         """Let the process optimise a last time and save its state; returns the file's path.
+
+        ``frames`` is the state of what frames observe that are no keyframes.
 
         Raises:
             InputError: it did not finish within the timeout.
@@ -237,7 +239,7 @@ class RemoteMapper:
         path = self._folder / ".live-final"
         if self.given_up:
             self.worker.try_again()
-        self.send(Finish(path, self._unsent_history()))
+        self.send(Finish(path, self._unsent_history(), frames))
         deadline_s = time.monotonic() + timeout_s
         while self.worker.busy and not self.given_up and time.monotonic() < deadline_s:
             self.catch_up(0.1)

@@ -1,0 +1,261 @@
+"""Adjustment of a whole graph together with the frames that are no keyframes.
+
+ISAM2 and the batch optimiser hold keyframes alone, since every variable costs them time at every
+update. At the end of a run the other frames' observations are known too, four times as many. Here
+all poses and landmarks are variables: Gauss-Newton steps, damped as Levenberg and Marquardt do, in
+which the landmarks are eliminated and the poses found by conjugate gradients on the Schur
+complement, which is never formed (Agarwal et al., Bundle Adjustment in the Large, ECCV 2010).
+All other factors (priors, loops, sensors, users' own) are linearised by GTSAM; their variables
+that are neither poses nor landmarks keep their values.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import bsr_array, csr_array
+from scipy.sparse.linalg import LinearOperator, cg
+
+from bmask_slam.graph.arrays import Array, Ints, Mask
+from bmask_slam.graph.batch.other_factors import OtherFactors
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.factors.checks import OBSERVATION_PROBABILITY, chi2_quantile, reprojection
+from bmask_slam.graph.factors.factor_tables import FactorTables
+from bmask_slam.graph.factors.graph_update import Observations, concatenate
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.marginals.point_elimination import linearise
+from bmask_slam.graph.smoother.isam2 import SolverError
+
+CHUNK = 16384
+"""Observations that are linearised at once: a few megabytes."""
+FIRST_DAMPING, LAST_DAMPING = 1e-5, 1e2
+MAX_STEPS = (5, 8)
+"""Before and after the frames' outliers are left out."""
+CG_STEPS, CG_TOLERANCE = 150, 3e-3
+_POINT_FLOOR_PER_M2 = 1e-6
+"""Information added to each point, that of a sigma of 1 km, so that it is invertible."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Frames that are no keyframes.
+
+    Attributes:
+        poses_world_camera: (F, 4, 4).
+        observations: of landmarks of the graph; ``keyframe_ids`` are rows of the poses, ascending.
+    """
+
+    poses_world_camera: Array
+    observations: Observations
+
+
+@dataclass(frozen=True, eq=False)
+class JointResult:
+    """What a joint adjustment found.
+
+    Attributes:
+        poses_world_camera: (F, 4, 4) of the frames.
+        cost_before, cost_after: without the outliers of frames.
+        steps: that were taken.
+        outliers: observations of frames that were left out.
+    """
+
+    poses_world_camera: Array
+    cost_before: float
+    cost_after: float
+    steps: int
+    outliers: int
+
+
+def adjust_jointly(
+    tables: FactorTables, frames: Frames, camera: Camera, config: SmootherConfig
+) -> JointResult:
+    """Adjust a graph in place with the observations of other frames; returns the frames' poses.
+
+    Observations of frames beyond their 95 % bound are left out after the first steps.
+
+    Raises:
+        SolverError: a factor cannot be evaluated, or the graph not be solved; nothing is changed.
+    """
+    try:
+        problem = _Problem(tables, frames, camera, config)
+        problem.descend(MAX_STEPS[0])
+        outliers = problem.drop_outliers()
+        before = problem.cost
+        problem.descend(MAX_STEPS[1])
+    except Exception as error:  # a user's factor may raise any
+        raise SolverError(str(error).strip().partition("\n")[0], None) from error
+    count = len(tables.keyframes.ids)
+    tables.keyframes.values = problem.poses[:count].copy()
+    tables.landmarks.values = problem.points
+    return JointResult(problem.poses[count:], before, problem.cost, problem.steps, outliers)
+
+
+class _Problem:
+    """All observations and factors with the present values of poses and points."""
+
+    def __init__(
+        self, tables: FactorTables, frames: Frames, camera: Camera, config: SmootherConfig
+    ) -> None:
+        own, others = tables.observations.all(), frames.observations
+        self._camera, self._config, self._count = camera, config, len(tables.keyframes.ids)
+        self._observations = concatenate([own, others])
+        known = np.searchsorted(tables.keyframes.ids, own.keyframe_ids)
+        self._pose = np.concatenate([known, others.keyframe_ids + self._count])
+        self._point = np.searchsorted(tables.landmarks.ids, self._observations.landmark_ids)
+        self.poses = np.concatenate([tables.keyframes.values, frames.poses_world_camera])
+        self.points = tables.landmarks.values.copy()
+        self._factors = OtherFactors(tables, camera, config)
+        self._damping, self.steps = FIRST_DAMPING, 0
+        self.cost = self._cost(self.poses, self.points)
+
+    def drop_outliers(self) -> int:
+        """Leave out observations of frames beyond their bound; returns their number."""
+        stereo = np.isfinite(self._observations.measurements[:, 2])
+        bound = chi2_quantile(OBSERVATION_PROBABILITY, np.where(stereo, 3, 2))
+        kept = np.ones(len(bound), bool)
+        for rows in self._chunks():
+            chosen = self._observations.select(rows)
+            where = self.poses[self._pose[rows]], self.points[self._point[rows]]
+            kept[rows] = reprojection(chosen, *where, self._camera)[1] <= bound[rows]
+        kept |= self._pose < self._count
+        self._keep(kept)
+        self.cost = self._cost(self.poses, self.points)
+        return int(np.count_nonzero(~kept))
+
+    def _keep(self, kept: Mask) -> None:
+        self._observations = self._observations.select(kept)
+        self._pose, self._point = self._pose[kept], self._point[kept]
+
+    def descend(self, max_steps: int) -> None:
+        """Take steps until the cost hardly falls."""
+        for _ in range(max_steps):
+            system = self._linearised()
+            before = self.cost
+            while not self._step(system):
+                self._damping *= 10
+                if self._damping > LAST_DAMPING:
+                    return
+            self._damping = max(self._damping / 10, FIRST_DAMPING)
+            self.steps += 1
+            if before - self.cost <= self._config.least_decrease * before:
+                return
+
+    def _step(self, system: _System) -> bool:
+        """Take a step if the cost falls; whether it does."""
+        xi, shift = system.solve(self._damping)
+        poses, points = self.poses @ se3_exp(xi), self.points + shift
+        cost = self._cost(poses, points)
+        if not cost < self.cost:
+            return False
+        self.poses, self.points, self.cost = poses, points, cost
+        return True
+
+    def _chunks(self) -> list[Ints]:
+        return _chunks(len(self._pose))
+
+    def _parts(self, rows: Ints, poses: Array, points: Array) -> tuple[Array, Array, Array]:
+        given = self._observations.select(rows), poses[self._pose[rows]], points[self._point[rows]]
+        return linearise(*given, self._camera, self._config)
+
+    def _cost(self, poses: Array, points: Array) -> float:
+        """Half the sum of squared errors with Huber's kernel; infinite beyond all values."""
+        total, config = self._factors.cost(poses[: self._count], points), self._config
+        with np.errstate(all="ignore"):
+            for rows in self._chunks():
+                squares = np.sum(self._parts(rows, poses, points)[0] ** 2, axis=1)
+                stereo = np.isfinite(self._observations.measurements[rows, 2])
+                k = np.where(stereo, config.huber_stereo, config.huber_mono)
+                # with the kernel's weight the squared error e^2 is k e beyond k
+                outer = config.robust & (squares > k**2)
+                total += float(np.sum(np.where(outer, squares - k**2 / 2, squares / 2)))
+        return total if math.isfinite(total) else math.inf
+
+    def _linearised(self) -> _System:
+        P, L = len(self.poses), len(self.points)
+        H_pose, g_pose = np.zeros((P, 6, 6)), np.zeros((P, 6))
+        H_point, g_point = np.zeros((L, 3, 3)), np.zeros((L, 3))
+        cross = np.zeros((len(self._pose), 6, 3))
+        for rows in self._chunks():
+            r, J_pose, J_point = self._parts(rows, self.poses, self.points)
+            to_pose, to_point = _sums(self._pose[rows], P), _sums(self._point[rows], L)
+            J_pose_T, J_point_T = J_pose.swapaxes(1, 2), J_point.swapaxes(1, 2)
+            cross[rows] = J_pose_T @ J_point
+            H_pose += (to_pose @ (J_pose_T @ J_pose).reshape(-1, 36)).reshape(P, 6, 6)
+            H_point += (to_point @ (J_point_T @ J_point).reshape(-1, 9)).reshape(L, 3, 3)
+            g_pose += to_pose @ (J_pose_T @ r[:, :, None])[:, :, 0]
+            g_point += to_point @ (J_point_T @ r[:, :, None])[:, :, 0]
+        A, b = self._factors.linearised(self.poses[: self._count], self.points, 6 * P)
+        g_pose -= (A.T @ b).reshape(P, 6)
+        order = np.lexsort((self._point, self._pose))
+        return _System(
+            H_pose, g_pose, H_point, g_point, A, cross[order], self._pose[order], self._point[order]
+        )
+
+
+def _chunks(count: int) -> list[Ints]:
+    """Rows 0 to count - 1, CHUNK at a time."""
+    return np.split(np.arange(count), range(CHUNK, count, CHUNK))
+
+
+def _sums(groups: Ints, count: int) -> csr_array:
+    """A matrix (count, M) that adds up the rows (M, n) of each group (M,)."""
+    return csr_array((np.ones(len(groups)), (groups, np.arange(len(groups)))), (count, len(groups)))
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    """Normal equations of poses and points at one place.
+
+    Blocks H_pose (P, 6, 6), H_point (L, 3, 3) and cross (M, 6, 3) with gradients (P, 6), (L, 3);
+    ``A`` (R, 6P) are the other factors.
+    """
+
+    H_pose: Array
+    g_pose: Array
+    H_point: Array
+    g_point: Array
+    A: csr_array
+    cross: Array
+    pose: Ints
+    point: Ints
+
+    def solve(self, damping: float) -> tuple[Array, Array]:
+        """Tangents (P, 6) of the poses, on the right side, and shifts (L, 3) of the points."""
+        P, L = len(self.H_pose), len(self.H_point)
+        starts = np.searchsorted(self.pose, np.arange(P + 1))
+        C = bsr_array((self.cross, self.point, starts), shape=(6 * P, 3 * L))
+        C_T = C.T.tocsr()
+        damped = self.H_point * (1 + damping * np.eye(3)) + _POINT_FLOOR_PER_M2 * np.eye(3)
+        inverse_point = np.asarray(np.linalg.inv(damped), float)
+        H_pose = self.H_pose * (1 + damping * np.eye(6))
+
+        def times(x: Array) -> Array:
+            """The Schur complement times x (6P,)."""
+            inner = (inverse_point @ (C_T @ x).reshape(L, 3, 1)).ravel()
+            outer = (H_pose @ x.reshape(P, 6, 1)).ravel()
+            return np.asarray(outer + self.A.T @ (self.A @ x) - C @ inner)
+
+        right = (inverse_point @ self.g_point[:, :, None]).ravel()
+        b = np.asarray(C @ right) - self.g_pose.ravel()
+        blocks = self._preconditioner(H_pose, inverse_point)
+        operator = LinearOperator((6 * P, 6 * P), times)
+        easier = LinearOperator((6 * P, 6 * P), lambda x: (blocks @ x.reshape(P, 6, 1)).ravel())
+        x, _ = cg(operator, b, rtol=CG_TOLERANCE, maxiter=CG_STEPS, M=easier)
+        shift = -right - (inverse_point @ (C_T @ x).reshape(L, 3, 1)).ravel()
+        return x.reshape(P, 6), shift.reshape(L, 3)
+
+    def _preconditioner(self, H_pose: Array, inverse_point: Array) -> Array:
+        """Inverses (P, 6, 6) of the diagonal blocks of the Schur complement."""
+        blocks = H_pose.copy()
+        for rows in _chunks(len(self.pose)):
+            cross = self.cross[rows]
+            known = cross @ inverse_point[self.point[rows]] @ cross.swapaxes(1, 2)
+            to_pose = _sums(self.pose[rows], len(blocks))
+            blocks -= (to_pose @ known.reshape(-1, 36)).reshape(blocks.shape)
+        squares = np.asarray(self.A.multiply(self.A).sum(axis=0)).reshape(-1, 6)
+        blocks[:, range(6), range(6)] += squares
+        return np.asarray(np.linalg.inv(blocks), float)
