@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bmask_slam.back_end.reinterpretation import KeyframeMotion, use_camera
+from bmask_slam.back_end.reinterpretation import KeyframeMotion, reinterpret_frames, use_camera
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import quaternion_from_rotation
@@ -122,10 +122,22 @@ class SensorSystem(SystemResults, SensorInput):
         """See `SensorInput.remove_factor`; the graph is optimised at once."""
         self._change_factors([], (number,))
 
-    def use_camera(self, camera: Camera, motions: Mapping[int, KeyframeMotion]) -> None:
-        """Go on with another camera; keyframes of known motion are interpreted anew by it."""
+    def use_camera(
+        self,
+        camera: Camera,
+        motions: Mapping[int, KeyframeMotion],
+        frame_motions: Mapping[float, KeyframeMotion] | None = None,
+    ) -> None:
+        """Go on with another camera; what was seen in known motion is interpreted anew by it.
+
+        ``motions`` are those of keyframes by id, ``frame_motions`` of other frames by stamp; what
+        frames of unknown motion observe is forgotten.
+        """
+        reinterpret_frames(self.frame_observations, frame_motions or {}, self.camera, camera)
         self.camera = self.camera_tracker.tracker.camera = camera
-        self.frame_observations.clear()  # made with the other camera
+        self._map_uses_camera(camera, motions)
+
+    def _map_uses_camera(self, camera: Camera, motions: Mapping[int, KeyframeMotion]) -> None:
         use_camera(self.mapper, camera, motions)
 
     def _change_factors(self, added: list[tuple[int, Any]], removed: tuple[int, ...]) -> None:

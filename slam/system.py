@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
-from bmask_slam.back_end.factors import stereo_measurements
 from bmask_slam.back_end.frame_adjustment import adjust_with_frames
 from bmask_slam.back_end.map_backend import MapBackend
 from bmask_slam.back_end.mapper import Mapper
@@ -252,9 +251,8 @@ class SlamSystem(SavedSystem):
             self.camera_tracker.remember(tracked.features, landmark_of, T_world_camera)
             self.camera_tracker.update_motion(tracked.T_world_camera, T_world_camera, ids)
         if not keyframe and tracked.status.by_image:
-            keypoints, features = tracked.keypoints, tracked.features
-            measured = stereo_measurements(features, keypoints), features.sigmas_px[keypoints]
-            self.frame_observations.append(frame.timestamp_s, tracked.landmark_ids, *measured)
+            seen = tracked.features, tracked.keypoints, tracked.landmark_ids
+            self.frame_observations.append(frame.timestamp_s, *seen)
         poses = reference.T_world_camera, T_world_camera
         self.map.history.append(frame.timestamp_s, reference.id, *poses, tracked.information)
         return T_world_camera

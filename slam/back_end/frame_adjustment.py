@@ -7,7 +7,7 @@ import logging
 import numpy as np
 
 from bmask_slam.back_end.factor_selection import read_back
-from bmask_slam.back_end.factors import quantised
+from bmask_slam.back_end.factors import quantised, stereo_measurements
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.batch.joint_adjustment import Frames, adjust_jointly
@@ -60,13 +60,16 @@ def _frames_in(mapper: Mapper, frames: FrameObservations) -> tuple[Array, Frames
         for p in paths
         for t, T in zip(p.timestamps_s.tolist(), p.poses_world_camera, strict=True)
     }
-    weights = np.array([1.0, 1.0, mapper.camera.graph_depth_factor])
+    camera = mapper.camera
+    weights = np.array([1.0, 1.0, camera.graph_depth_factor])
     for view in frames.views:
         ids, first = np.unique(current(view.landmark_ids), return_index=True)  # some were fused
         rows = first[known.contains(ids)]
         if len(rows) < MIN_LANDMARKS or view.timestamp_s not in pose_at:
             continue
-        measured = view.measurements[rows].astype(float), quantised(view.sigmas_px[rows] * weights)
+        features = view.features(camera.stereo_bf_px_m)
+        sigmas_px = quantised(features.sigmas_px[rows] * weights)
+        measured = stereo_measurements(features, rows), sigmas_px
         frame = np.full(len(rows), len(poses))
         parts.append(Observations(frame, ids[known.contains(ids)], *measured))
         poses.append(pose_at[view.timestamp_s])

@@ -15,6 +15,7 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Ints, no_ids
 from bmask_slam.graph.camera import Camera
 from bmask_slam.tracking.rolling_shutter import Motion, after_mean_row_s, at_one_moment, velocities
+from bmask_slam.world.frame_observations import FrameObservations
 from bmask_slam.world.keyframe import Keyframe
 
 logger = logging.getLogger(__name__)
@@ -52,13 +53,33 @@ def use_camera(mapper: Mapper, camera: Camera, motions: Mapping[int, KeyframeMot
     read_back(mapper.world, estimate)
 
 
+def reinterpret_frames(
+    frames: FrameObservations, motions: Mapping[float, KeyframeMotion], old: Camera, new: Camera
+) -> None:
+    """The same for frames that are no keyframes, by stamp; those of unknown motion are dropped."""
+    bf = old.stereo_bf_px_m
+    frames.views = [
+        view.seen_as(reinterpreted(view.features(bf), motions[view.timestamp_s], old, new))
+        for view in frames.views
+        if view.timestamp_s in motions
+    ]
+
+
 def reinterpret(keyframe: Keyframe, motion: KeyframeMotion, old: Camera, new: Camera) -> None:
     """Give a keyframe the features that tracking with another camera would have made of it.
 
-    Its keypoints were moved to one moment by the readout time of the old camera; they begin at
-    their places in the image again. What it observes stays.
+    What it observes stays.
     """
-    features, known = keyframe.features, Motion(motion.twist, 0.0)
+    keyframe.features = reinterpreted(keyframe.features, motion, old, new)
+
+
+def reinterpreted(features: Features, motion: KeyframeMotion, old: Camera, new: Camera) -> Features:
+    """The features that tracking with another camera would have made of the same keypoints.
+
+    They were moved to one moment by the readout time of the old camera, and begin at their places
+    in the image again.
+    """
+    known = Motion(motion.twist, 0.0)
     depth_m = _as_exposed_m(features, motion.twist, old)
     pixels = features.image_pixels
     depth_m /= 1 + depth_m * (old.depth_bend(pixels) - new.depth_bend(pixels))
@@ -73,7 +94,7 @@ def reinterpret(keyframe: Keyframe, motion: KeyframeMotion, old: Camera, new: Ca
         depth_m=depth_m,
         disparity_px=new.stereo_bf_px_m / depth_m,
     )
-    keyframe.features = at_one_moment(raw, new, known if new.rolling_shutter_s else None)
+    return at_one_moment(raw, new, known if new.rolling_shutter_s else None)
 
 
 def _as_exposed_m(features: Features, twist: Array, camera: Camera) -> Array:

@@ -1,4 +1,4 @@
-"""By what a map's keyframes are interpreted anew with a camera that was found.
+"""By what keyframes and other frames are interpreted anew with a camera that was found.
 
 Their rows were exposed one after the other, and their depth images some time before or after: with
 another readout time or delay, keypoints and depths move by the camera's velocity.
@@ -17,11 +17,14 @@ from bmask_slam.features.brisk import FeatureConfig, sample_depth
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.sequences.sequence import Sequence
+from bmask_slam.world.frame_observations import FrameObservations
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
 DepthChange = Callable[[Keyframe], tuple[Ints, Array]]
 """Keypoints (N,) of a keyframe, and what to add to their inverse depths (N,) in 1/m."""
+FrameChange = Callable[[float, Array], tuple[Ints, Array]]
+"""The same from a frame's stamp and the places (N, 2) of its keypoints in the image."""
 
 
 def keyframe_motions(
@@ -39,6 +42,22 @@ def keyframe_motions(
     return motions
 
 
+def frame_motions(
+    frames: FrameObservations, paths: Mapping[int, Trajectory], depth_change: FrameChange | None
+) -> dict[float, KeyframeMotion]:
+    """The motion of the other frames, by stamp."""
+    motions = {}
+    for path in paths.values():
+        known = set(path.timestamps_s.tolist())
+        for view in frames.views:
+            if view.timestamp_s in known:
+                pixels = view.columns[:, 2:4].astype(float)
+                change = depth_change(view.timestamp_s, pixels) if depth_change else ()
+                twist = _twist_of(view.timestamp_s, path)
+                motions[view.timestamp_s] = KeyframeMotion(twist, *change)
+    return motions
+
+
 def _twist_of(stamp_s: float, path: Trajectory | None) -> Array:
     """The camera's velocity (6,) at a stamp; zero where it is not known."""
     if path is None or not len(path):
@@ -47,20 +66,22 @@ def _twist_of(stamp_s: float, path: Trajectory | None) -> Array:
 
 
 def depth_change_between(
-    before: Sequence, after: Sequence, keyframe: Keyframe, config: FeatureConfig
+    before: Sequence, after: Sequence, seen: tuple[float, Array], config: FeatureConfig
 ) -> tuple[Ints, Array]:
-    """What another delay does to a keyframe's depths, by its images; 0 where either has none.
+    """What another delay does to the depths of keypoints, by their images; 0 where one has none.
 
-    The sequences are the same images with either delay. Raises InputError for a broken image.
+    ``seen`` are a frame's stamp and the places (N, 2) of its keypoints in the image. The sequences
+    are the same images with either delay. Raises InputError for a broken image.
     """
-    old, new = (_inverse_depth(images, keyframe, config) for images in (before, after))
+    old, new = (_inverse_depth(images, *seen, config) for images in (before, after))
     return np.arange(len(old)), np.nan_to_num(new - old)
 
 
-def _inverse_depth(sequence: Sequence, keyframe: Keyframe, config: FeatureConfig) -> Array:
+def _inverse_depth(
+    sequence: Sequence, stamp_s: float, pixels: Array, config: FeatureConfig
+) -> Array:
     """As tracking measures it at keypoints, in 1/m (N,); NaN if the sequence has no such frame."""
-    pixels = keyframe.features.image_pixels
-    frames = frames_of({keyframe.id: keyframe.timestamp_s}, sequence)
-    if keyframe.id not in frames:
+    frames = frames_of({0: stamp_s}, sequence)
+    if not frames:
         return np.full(len(pixels), np.nan)
-    return 1.0 / sample_depth(sequence.depth(frames[keyframe.id])[0], pixels, config)[0]
+    return 1.0 / sample_depth(sequence.depth(frames[0])[0], pixels, config)[0]

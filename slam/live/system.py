@@ -126,10 +126,8 @@ class LiveSystem(SlamSystem):
         made = result.keyframe_id
         return None if made is None else self.remote.world.keyframes.get(made)
 
-    def use_camera(self, camera: Camera, motions: Mapping[int, KeyframeMotion]) -> None:
-        """Track with another camera from the next frame on, and tell the map."""
-        self.camera = self.camera_tracker.tracker.camera = camera
-        self.frame_observations.clear()
+    def _map_uses_camera(self, camera: Camera, motions: Mapping[int, KeyframeMotion]) -> None:
+        """Tell the map; tracking uses the camera from the next frame on."""
         self.remote.send(UseCamera(camera, dict(motions)))
 
     def add_measurements(self, new: Measurements) -> None:

@@ -29,7 +29,11 @@ from bmask_slam.calibration.adoption import (
     format_found,
     judged,
 )
-from bmask_slam.calibration.keyframe_motions import depth_change_between, keyframe_motions
+from bmask_slam.calibration.keyframe_motions import (
+    depth_change_between,
+    frame_motions,
+    keyframe_motions,
+)
 from bmask_slam.calibration.rematching import estimate_again
 from bmask_slam.calibration.views import SequenceDepths
 from bmask_slam.graph.arrays import Array, Ints, no_ids
@@ -110,7 +114,7 @@ class SelfCalibrator:
         if camera == before.camera:
             return False
         system.events.calibration(self.state.text)
-        system.use_camera(camera, _motions(system, sequence, camera))
+        system.use_camera(camera, *_motions(system, sequence, camera))
         return True
 
     def _forget_masks(self) -> None:
@@ -138,17 +142,26 @@ def _reader(system: SlamSystem, sequence: Sequence) -> SequenceDepths:
     return SequenceDepths({k.id: k.timestamp_s for k in keyframes}, sequence)
 
 
-def _motions(system: SlamSystem, sequence: Sequence, camera: Camera) -> dict[int, KeyframeMotion]:
-    """By what the keyframes are interpreted anew with a camera that replaces the system's."""
-    world, offset_s = system.mapper.world, camera.depth_time_offset_s
+def _motions(
+    system: SlamSystem, sequence: Sequence, camera: Camera
+) -> tuple[dict[int, KeyframeMotion], dict[float, KeyframeMotion]]:
+    """By what keyframes and other frames are interpreted anew with a camera that was found."""
+    offset_s, paths = camera.depth_time_offset_s, system.segments()
     retimed = sequence.with_camera(replace(sequence.camera, depth_time_offset_s=offset_s))
+    late = offset_s != sequence.camera.depth_time_offset_s
 
-    def change(keyframe: Keyframe) -> tuple[Ints, Array]:
+    def change(stamp_s: float, pixels: Array) -> tuple[Ints, Array]:
         try:
-            return depth_change_between(sequence, retimed, keyframe, system.config.features)
+            seen = stamp_s, pixels
+            return depth_change_between(sequence, retimed, seen, system.config.features)
         except InputError as error:
-            logger.warning("calibration: the delay of a keyframe's depth stays: %s", error)
+            logger.warning("calibration: the delay of a frame's depth stays: %s", error)
             return no_ids(), np.zeros(0)
 
-    late = offset_s != sequence.camera.depth_time_offset_s
-    return keyframe_motions(world, system.segments(), change if late else None)
+    def of_keyframe(keyframe: Keyframe) -> tuple[Ints, Array]:
+        return change(keyframe.timestamp_s, keyframe.features.image_pixels)
+
+    return (
+        keyframe_motions(system.mapper.world, paths, of_keyframe if late else None),
+        frame_motions(system.frame_observations, paths, change if late else None),
+    )

@@ -113,6 +113,10 @@ def system() -> SlamSystem:
         PendingMovable(1, first, 0.25, np.ones((4, 3)), tuple(removed), 2, 1),
         PendingMovable(2, second, 0.5, np.full((3, 3), 0.5), (removed[1],), 1, 3),
     ]
+    features = system.mapper.world.keyframes[first].features
+    for k in (0, 1):
+        seen = features, np.arange(k, 5 + k), np.arange(2 * k, 5 + 2 * k)
+        system.frame_observations.append(FRAMES[k].timestamp_s, *seen)
     loops.closed = {(first, second): True, (first, second + 1): False}
     loops.recogniser.dismiss(first, second)
     loops.recogniser._previous = [(frozenset({first, second}), 1), (frozenset({second}), 2)]

@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, make_features, points_before, random_descriptors
 
-from bmask_slam.back_end.reinterpretation import KeyframeMotion, reinterpret
+from bmask_slam.back_end.reinterpretation import (
+    KeyframeMotion,
+    reinterpret,
+    reinterpret_frames,
+)
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.tracking.rolling_shutter import share_of_rows
+from bmask_slam.world.frame_observations import FrameObservations, FrameView
 from bmask_slam.world.keyframe import Keyframe
 
 TWIST = np.array([0.5, -0.6, 0.4, 0.3, 0.2, -0.3])
@@ -36,6 +41,13 @@ def exposed_keyframe() -> tuple[Keyframe, Array]:
     return Keyframe(0, 0, 0.0, 0, np.eye(4), features, ids), transform(
         inverse(T_mean), points_world
     )
+
+
+def as_view(keyframe: Keyframe, stamp_s: float) -> FrameView:
+    """What a frame would keep of the same features."""
+    frames, every = FrameObservations(), np.arange(len(keyframe.features))
+    frames.append(stamp_s, keyframe.features, every, every)
+    return frames.views[0]
 
 
 def error_px(keyframe: Keyframe, points: Array) -> float:
@@ -87,3 +99,20 @@ def test_a_bend_of_depth_that_is_found_later_is_taken_out_at_each_keypoint() -> 
     assert np.ptp(bend) > 5e-3
     reinterpret(keyframe, KeyframeMotion(TWIST), bent, CAMERA)
     np.testing.assert_allclose(keyframe.features.depth_m, before_m)
+
+
+def test_frames_are_interpreted_anew_like_keyframes_and_dropped_if_their_motion_is_unknown() -> (
+    None
+):
+    keyframe, _ = exposed_keyframe()
+    frames = FrameObservations()
+    frames.views = [as_view(keyframe, stamp_s) for stamp_s in (1.0, 2.0)]
+    motion = KeyframeMotion(TWIST, np.array([3, 5]), np.array([0.01, -0.02]))
+    reinterpret_frames(frames, {2.0: motion}, CAMERA, ROLLING)
+    reinterpret(keyframe, motion, CAMERA, ROLLING)
+    (view,) = frames.views
+    assert view.timestamp_s == 2.0
+    seen = view.features(CAMERA.stereo_bf_px_m)
+    for name in ("pixels", "depth_m", "disparity_px"):
+        expected = getattr(keyframe.features, name)
+        np.testing.assert_allclose(getattr(seen, name), expected, rtol=1e-5, err_msg=name)
