@@ -23,6 +23,7 @@ from bmask_slam.graph.geometry import (
 from bmask_slam.graph.whole_file import whole_file
 
 MAX_TIME_DIFFERENCE_S = 0.02
+MAX_STAMP_ERROR_S = 1e-5  # of stamps with six decimals
 MAX_TYPICAL_STEP_S = 5.0
 TUM_HEADER = "# timestamp_s tx ty tz qx qy qz qw (T_world_camera, metres)"
 

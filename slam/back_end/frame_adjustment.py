@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -11,11 +12,14 @@ from bmask_slam.back_end.factors import quantised, stereo_measurements
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.batch.joint_adjustment import Frames, adjust_jointly
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations, concatenate
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.smoother.isam2 import SolverError
-from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.world.frame_observations import FrameObservations
+from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, Trajectory, nearest_indices
+from bmask_slam.world.frame_observations import FrameObservations, FrameView
+from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 
@@ -28,9 +32,9 @@ MAX_OBSERVATIONS = 500_000
 def adjust_with_frames(mapper: Mapper, frames: FrameObservations, config: SmootherConfig) -> None:
     """Adjust map and graph with what other frames observe too, and give these their poses."""
     smoother, history = mapper.smoother, mapper.history
-    stamps_s, given = _frames_in(mapper, frames)
-    total = len(smoother.tables.observations) + len(given.observations)
-    if not len(stamps_s) or total > MAX_OBSERVATIONS:
+    paths = history.trajectories(mapper.world).values()
+    stamps_s, given = frames_in(frames.views, mapper.world, smoother.tables, paths, mapper.camera)
+    if not len(stamps_s):
         return
     try:
         found = adjust_jointly(smoother.tables, given, mapper.camera, config)
@@ -48,30 +52,56 @@ def adjust_with_frames(mapper: Mapper, frames: FrameObservations, config: Smooth
     history.place(mapper.world, Trajectory(stamps_s, found.poses_world_camera))
 
 
-def _frames_in(mapper: Mapper, frames: FrameObservations) -> tuple[Array, Frames]:
-    """Stamps (F,) of the frames that observe enough of the graph, and what they observe."""
-    known, current = mapper.smoother.tables.landmarks, mapper.world.landmarks.current
+def frames_in(
+    views: Sequence[FrameView],
+    world: WorldMap,
+    tables: FactorTables,
+    paths: Iterable[Trajectory],
+    camera: Camera,
+) -> tuple[Array, Frames]:
+    """Stamps (F,) of the frames that observe enough of the graph, and what they observe.
+
+    They begin at their poses in the paths. The errors of images in a row are alike: the same patch
+    of a landmark and the same error of the depth sensor are in all of them. So all frames together
+    count as much as the keyframes: their sigmas are larger by the root of how many more they are.
+    None if graph and frames have more observations than ``MAX_OBSERVATIONS``.
+    """
+    known, weights = tables.landmarks, np.array([1.0, 1.0, camera.graph_depth_factor])
     parts: list[Observations] = []
     poses: list[Array] = []
     stamps_s: list[float] = []
-    paths = mapper.history.trajectories(mapper.world).values()
-    pose_at = {
-        t: T
-        for p in paths
-        for t, T in zip(p.timestamps_s.tolist(), p.poses_world_camera, strict=True)
-    }
-    camera = mapper.camera
-    weights = np.array([1.0, 1.0, camera.graph_depth_factor])
-    for view in frames.views:
-        ids, first = np.unique(current(view.landmark_ids), return_index=True)  # some were fused
-        rows = first[known.contains(ids)]
-        if len(rows) < MIN_LANDMARKS or view.timestamp_s not in pose_at:
+    for view, pose in _with_poses(views, paths):
+        exist = np.flatnonzero(view.landmark_ids < len(world.landmarks))
+        ids = world.landmarks.current(view.landmark_ids[exist])  # some were fused since
+        ids, first = np.unique(ids, return_index=True)
+        rows = exist[first]
+        in_graph = known.contains(ids)
+        ids, rows = ids[in_graph], rows[in_graph]
+        if len(ids) < MIN_LANDMARKS:
             continue
         features = view.features(camera.stereo_bf_px_m)
         sigmas_px = quantised(features.sigmas_px[rows] * weights)
-        measured = stereo_measurements(features, rows), sigmas_px
-        frame = np.full(len(rows), len(poses))
-        parts.append(Observations(frame, ids[known.contains(ids)], *measured))
-        poses.append(pose_at[view.timestamp_s])
+        frame, measured = np.full(len(ids), len(poses)), stereo_measurements(features, rows)
+        parts.append(Observations(frame, ids, measured, sigmas_px))
+        poses.append(pose)
         stamps_s.append(view.timestamp_s)
-    return np.array(stamps_s), Frames(np.array(poses).reshape(-1, 4, 4), concatenate(parts))
+    if sum(map(len, parts)) + len(tables.observations) > MAX_OBSERVATIONS:
+        return np.zeros(0), Frames(np.zeros((0, 4, 4)), Observations())
+    given = concatenate(parts)
+    given.sigmas_px[:] *= np.sqrt(max(len(poses) / len(tables.keyframes.ids), 1.0))
+    return np.array(stamps_s), Frames(np.array(poses).reshape(-1, 4, 4), given)
+
+
+def _with_poses(
+    views: Sequence[FrameView], paths: Iterable[Trajectory]
+) -> Iterator[tuple[FrameView, Array]]:
+    """The views that have a pose T_world_camera (4, 4) in one of the paths, with it, in order."""
+    stamps_s = np.array([view.timestamp_s for view in views])
+    found: dict[int, Array] = {}
+    for path in paths:
+        at = nearest_indices(path.timestamps_s, stamps_s)
+        same = np.abs(path.timestamps_s[at] - stamps_s) < MAX_STAMP_ERROR_S
+        found |= dict(
+            zip(np.flatnonzero(same).tolist(), path.poses_world_camera[at[same]], strict=True)
+        )
+    return ((views[k], found[k]) for k in sorted(found))

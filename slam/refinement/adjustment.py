@@ -7,6 +7,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from bmask_slam.back_end.frame_adjustment import frames_in
 from bmask_slam.evaluation import (
     EvaluationResult,
     Row,
@@ -19,8 +20,11 @@ from bmask_slam.evaluation.plot import plot_trajectory
 from bmask_slam.events import EVENTS, read_events
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment, AdjustmentConfig, Stage, adjust
 from bmask_slam.graph.batch.iteration import Progress
+from bmask_slam.graph.batch.joint_adjustment import adjust_jointly
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import fitting, part
 from bmask_slam.graph.files.ply import write_ply
+from bmask_slam.graph.smoother.isam2 import SolverError
 from bmask_slam.graph.smoother.storage import write_graph
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.graph.whole_file import whole_file
@@ -31,6 +35,8 @@ from bmask_slam.run_folder.frame_file import FRAMES
 from bmask_slam.run_folder.landmark_file import LANDMARKS_COMMENT
 from bmask_slam.run_folder.map_file import MAP, SavedRun, read_map, read_run, write_map
 from bmask_slam.run_folder.metrics import EVALUATION_ROWS
+from bmask_slam.world.frame_observations import FrameObservations
+from bmask_slam.world.map_state import world_of
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +50,7 @@ class RunAdjustment:
     Attributes:
         folder: the new run folder.
         adjustment: the result of the solver.
+        frames: what followed it with the frames that are no keyframes, if anything.
         graph: the keyframes and landmarks after it.
         errors: before and after, against the reference, if there is one.
         picture: the file of the picture before/after.
@@ -51,6 +58,7 @@ class RunAdjustment:
 
     folder: Path
     adjustment: Adjustment
+    frames: Stage | None
     graph: GraphSnapshot
     errors: tuple[EvaluationResult, EvaluationResult] | None
     picture: Path
@@ -102,17 +110,48 @@ def adjust_run(
             adjustment = adjust(run.tables, run.camera, run.config, config, progress)
         except InputError as error:
             raise InputError(f"{path / 'graph'}: {error}") from error
+        frames = _with_frames(run)
         trajectory = _write_run(run, before, adjustment, folder)
         given, errors = run.trajectories["trajectory.txt"], None
         if truth is not None:
             errors = (evaluate_trajectory(given, truth), evaluate_trajectory(trajectory, truth))
         after = GraphSnapshot.of(run.tables)
-        result = RunAdjustment(folder.path, adjustment, after, errors, plot or out / PICTURE)
+        result = RunAdjustment(
+            folder.path, adjustment, frames, after, errors, plot or out / PICTURE
+        )
         folder.write_text("metrics.json", format_json(result_rows(result)))
         picture, events = folder.path / "trajectory.png", read_events(path)
         plot_trajectory(picture, trajectory, truth, folder.path.name, events)
         draw_adjustment(result.picture, before, after, adjustment)
         return result
+
+
+def _with_frames(run: SavedRun) -> Stage | None:
+    """Adjust the graph with what frames observe that are no keyframes; None if that is not known.
+
+    As at the end of a run (`slam.back_end.frame_adjustment`).
+    """
+    file, frames = run.path / MAP, FrameObservations()
+    if not file.is_file():
+        return None
+    state, _ = read_map(run.path)
+    saved = part(state, "frames")
+    if not saved:  # of a version that did not keep them
+        return None
+    with fitting(file):
+        frames.restore(saved)
+        world = world_of(part(part(state, "mapper"), "world"))
+        paths = run.trajectories.values()
+        stamps_s, given = frames_in(frames.views, world, run.tables, paths, run.camera)
+    if not len(stamps_s):
+        return None
+    factors = len(run.tables) + len(given.observations)
+    try:
+        found = adjust_jointly(run.tables, given, run.camera, run.config)
+    except SolverError as error:
+        logger.warning("frames are left out: %s", error)
+        return None
+    return Stage("all frames", factors, found.cost_before, found.cost_after, found.steps)
 
 
 def _write_run(
@@ -164,7 +203,7 @@ def result_rows(result: RunAdjustment) -> list[Row]:
 
 def format_run_adjustment(result: RunAdjustment) -> str:
     """The adjustment as text, with the errors before and after."""
-    lines = [format_adjustment(result.adjustment, result.graph)]
+    lines = [format_adjustment(result.adjustment, result.graph, result.frames)]
     for before, after in zip(*(errors.rows for errors in result.errors or ()), strict=True):
         if after["name"] in EVALUATION_ROWS:
             lines.append(
@@ -173,14 +212,14 @@ def format_run_adjustment(result: RunAdjustment) -> str:
     return "\n".join(lines)
 
 
-def format_adjustment(done: Adjustment, graph: GraphSnapshot) -> str:
+def format_adjustment(done: Adjustment, graph: GraphSnapshot, frames: Stage | None = None) -> str:
     """A few lines: the graph, the costs of each stage, and the outliers."""
-    share = 0.0
+    share, last = 0.0, () if frames is None else (frames,)
     if done.observations:
         share = 100 * len(done.wrong_observations) / done.observations
     rows = [
         ("graph", f"{len(graph.keyframe_ids)} keyframes, {len(graph.landmark_ids)} landmarks"),
-        *((f"stage {stage.name}", _stage_text(stage)) for stage in done.stages),
+        *((f"stage {stage.name}", _stage_text(stage)) for stage in (*done.stages, *last)),
         ("wrong loops", f"{len(done.wrong_loops)} of {done.loops}, left out"),
         ("wrong views", f"{len(done.wrong_observations)} of {done.observations} ({share:.2f} %)"),
         ("time", f"{done.duration_ms:.0f} ms"),

@@ -15,7 +15,7 @@ from PIL import ImageDraw, ImageFont
 
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.trajectory import nearest_indices
+from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, nearest_indices
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.reporting.drawing import COLOURS
 from bmask_slam.reporting.film_cloud import (
@@ -27,7 +27,6 @@ from bmask_slam.reporting.film_cloud import (
 )
 from bmask_slam.reporting.film_view import SWING_DEG, Colour, MapPicture, MapView, make_view
 from bmask_slam.run_folder.folder import DENSE
-from bmask_slam.run_folder.frame_file import MAX_STAMP_ERROR_S
 from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.run_folder.semantic_files import OBJECTS, SavedObject, read_scene

@@ -22,7 +22,7 @@ COLUMNS = (
     *(f"{stage}_ms" for stage in STAGES),
     *("keyframe", "keyframe_reason"),
 )
-MAX_STAMP_ERROR_S = 1e-5  # of stamps with six decimals
+
 _NEEDED = ("index", "timestamp", "status", "keyframe")
 
 

@@ -23,9 +23,9 @@ from bmask_slam.graph.files.array_file import FileKind, part, read_arrays, write
 from bmask_slam.graph.files.ply import POINTS, read_ply
 from bmask_slam.graph.marginals.landmark_marginalisation import reinsert
 from bmask_slam.graph.smoother.storage import read_camera, read_graph
-from bmask_slam.graph.trajectory import Trajectory, read_tum
+from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, Trajectory, read_tum
 from bmask_slam.run_folder.folder import trajectory_files
-from bmask_slam.run_folder.frame_file import FRAMES, MAX_STAMP_ERROR_S, read_frames
+from bmask_slam.run_folder.frame_file import FRAMES, read_frames
 from bmask_slam.run_folder.origin import CONFIG
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.observation import observation_model

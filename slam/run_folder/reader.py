@@ -18,12 +18,11 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.json_file import STRICT, read_json
 from bmask_slam.graph.files.reading import read_text
 from bmask_slam.graph.sensors.markers import MarkerMap
-from bmask_slam.graph.trajectory import Trajectory, nearest_indices, read_tum
+from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, Trajectory, nearest_indices, read_tum
 from bmask_slam.run_folder.covariance_file import COVARIANCES, read_covariances
 from bmask_slam.run_folder.folder import CHECKPOINT, DENSE, FILES, trajectory_files
 from bmask_slam.run_folder.frame_file import (
     FRAMES,
-    MAX_STAMP_ERROR_S,
     FrameTable,
     read_frames,
 )

@@ -14,8 +14,8 @@ from bmask_slam.graph.arrays import Array, Arrays, Bytes
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.graph_update import RelativePose
 from bmask_slam.graph.files.ply import POINTS, read_ply
-from bmask_slam.graph.trajectory import Trajectory, nearest_indices
-from bmask_slam.run_folder.frame_file import FRAMES, MAX_STAMP_ERROR_S, FrameTable, read_frames
+from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, Trajectory, nearest_indices
+from bmask_slam.run_folder.frame_file import FRAMES, FrameTable, read_frames
 from bmask_slam.run_folder.map_file import SavedRun, read_run
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.run_folder.semantic_files import OBJECTS, read_objects

@@ -10,8 +10,8 @@ import numpy as np
 from bmask_slam.datasets.weights import find_weights
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.trajectory import nearest_indices
-from bmask_slam.run_folder.frame_file import MAX_STAMP_ERROR_S, FrameTable
+from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, nearest_indices
+from bmask_slam.run_folder.frame_file import FrameTable
 from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.semantics.segmenters.segmenter import Segmenter

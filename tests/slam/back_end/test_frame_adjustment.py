@@ -101,7 +101,13 @@ def test_landmarks_that_were_fused_since_count_as_what_they_are_now() -> None:
     known = system.mapper.smoother.tables.landmarks.contains(views[0].landmark_ids)
     gone, kept = views[0].landmark_ids[known][:2].tolist()
     world.replace_landmarks(np.array([gone]), np.array([kept]))
-    _, given = frame_adjustment._frames_in(system.mapper, system.frame_observations)
+    _, given = frame_adjustment.frames_in(
+        system.frame_observations.views,
+        world,
+        system.mapper.smoother.tables,
+        system.map.history.trajectories(world).values(),
+        CAMERA,
+    )
     assert gone not in given.observations.landmark_ids
     assert np.count_nonzero(given.observations.landmark_ids == kept) > 0
 

@@ -20,9 +20,10 @@ from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_exp
 from bmask_slam.graph.smoother.storage import read_graph, write_graph
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
 from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.refinement.adjustment import AdjustOptions, adjust_run
 from bmask_slam.refinement.adjustment_plot import View, draw_before_after
 from bmask_slam.refinement.carried_along import move_frames
-from bmask_slam.run_folder.map_file import read_map, read_run
+from bmask_slam.run_folder.map_file import read_map, read_run, write_map
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.map_state import world_of
 
@@ -182,9 +183,50 @@ def test_the_saved_map_is_the_adjusted_one(kitchen: Path, adjusted: Path, tmp_pa
         assert np.linalg.norm(error_m, axis=1).max() < 0.02
 
 
-def test_the_exported_graph_is_adjusted_to_the_same_cost(
-    kitchen: Path, adjusted: Path, tmp_path: Path
+def without_frames(kitchen: Path, folder: Path) -> Path:
+    """A copy of the run that lacks what frames observe, as those of older versions do."""
+    shutil.copytree(kitchen, folder)
+    state, camera = read_map(folder)
+    write_map(
+        folder / "map", {k: a for k, a in state.items() if not k.startswith("frames.")}, camera
+    )
+    return folder
+
+
+def test_frames_that_are_no_keyframes_count_too(
+    capsys, kitchen: Path, adjusted: Path, tmp_path: Path
 ) -> None:
+    """An adjusted run stays where it is; by keyframes alone it would move."""
+    printed = {}
+    for name, run_folder in (
+        ("with", adjusted),
+        ("without", without_frames(adjusted, tmp_path / "a")),
+    ):
+        assert optimise(run_folder, "--out", tmp_path / name) == 0
+        printed[name] = capsys.readouterr().out
+    assert "stage all frames" in printed["with"]
+    assert "all frames" not in printed["without"]
+    before = read_tum(adjusted / "keyframes.txt").positions_world
+    moved_m = {
+        name: np.linalg.norm(read_tum(tmp_path / name / "keyframes.txt").positions_world - before)
+        for name in printed
+    }
+    assert moved_m["with"] < 0.5 * moved_m["without"]
+
+
+def test_broken_columns_of_frames_are_refused(kitchen: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken"
+    shutil.copytree(kitchen, broken)
+    state, camera = read_map(broken)
+    write_map(broken / "map", {**state, "frames.columns": state["frames.columns"][:-3]}, camera)
+    with pytest.raises(InputError, match="do not fit together"):
+        adjust_run(AdjustOptions(broken, tmp_path / "out"))
+
+
+def test_the_exported_graph_is_adjusted_to_the_same_cost(kitchen: Path, tmp_path: Path) -> None:
+    adjusted = tmp_path / "adjusted"
+    alone = without_frames(kitchen, tmp_path / "alone")  # as the exported graph is
+    assert optimise(alone, "--out", adjusted, "--quiet") == 0
     file, out = tmp_path / "a.g2o", tmp_path / "b.g2o"
     words = ["export", kitchen, "--format", "g2o", "--out", file, "--quiet"]
     assert cli.main([str(word) for word in words]) == 0
