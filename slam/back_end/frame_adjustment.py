@@ -85,11 +85,11 @@ def frames_in(
         parts.append(Observations(frame, ids, measured, sigmas_px))
         poses.append(pose)
         stamps_s.append(view.timestamp_s)
-    if sum(map(len, parts)) + len(tables.observations) > MAX_OBSERVATIONS:
+    if not parts or sum(map(len, parts)) + len(tables.observations) > MAX_OBSERVATIONS:
         return np.zeros(0), Frames(np.zeros((0, 4, 4)), Observations())
     given = concatenate(parts)
     given.sigmas_px[:] *= np.sqrt(max(len(poses) / len(tables.keyframes.ids), 1.0))
-    return np.array(stamps_s), Frames(np.array(poses).reshape(-1, 4, 4), given)
+    return np.array(stamps_s), Frames(np.array(poses), given)
 
 
 def _with_poses(

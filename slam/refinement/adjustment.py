@@ -116,12 +116,11 @@ def adjust_run(
         if truth is not None:
             errors = (evaluate_trajectory(given, truth), evaluate_trajectory(trajectory, truth))
         after = GraphSnapshot.of(run.tables)
-        result = RunAdjustment(
-            folder.path, adjustment, frames, after, errors, plot or out / PICTURE
-        )
+        done = adjustment, frames, after, errors
+        result = RunAdjustment(folder.path, *done, plot or out / PICTURE)
         folder.write_text("metrics.json", format_json(result_rows(result)))
-        picture, events = folder.path / "trajectory.png", read_events(path)
-        plot_trajectory(picture, trajectory, truth, folder.path.name, events)
+        picture = folder.path / "trajectory.png"
+        plot_trajectory(picture, trajectory, truth, folder.path.name, read_events(path))
         draw_adjustment(result.picture, before, after, adjustment)
         return result
 
