@@ -114,17 +114,19 @@ class _Problem:
 
     def drop_outliers(self) -> int:
         """Leave out observations of frames beyond their bound; returns their number."""
-        stereo = np.isfinite(self._observations.measurements[:, 2])
-        bound = chi2_quantile(OBSERVATION_PROBABILITY, np.where(stereo, 3, 2))
+        bound = chi2_quantile(OBSERVATION_PROBABILITY, np.where(self._stereo, 3, 2))
         kept = np.ones(len(bound), bool)
         for rows in self._chunks():
-            chosen = self._observations.select(rows)
-            where = self.poses[self._pose[rows]], self.points[self._point[rows]]
-            kept[rows] = reprojection(chosen, *where, self._camera)[1] <= bound[rows]
+            kept[rows] = self._chi2(rows, self.poses, self.points) <= bound[rows]
         kept |= self._pose < self._count
         self._keep(kept)
         self.cost = self._cost(self.poses, self.points)
         return int(np.count_nonzero(~kept))
+
+    @property
+    def _stereo(self) -> Mask:
+        """(M,) which observations have depth."""
+        return np.isfinite(self._observations.measurements[:, 2])
 
     def _keep(self, kept: Mask) -> None:
         self._observations = self._observations.select(kept)
@@ -157,22 +159,20 @@ class _Problem:
     def _chunks(self) -> list[Ints]:
         return _chunks(len(self._pose))
 
-    def _parts(self, rows: Ints, poses: Array, points: Array) -> tuple[Array, Array, Array]:
-        given = self._observations.select(rows), poses[self._pose[rows]], points[self._point[rows]]
-        return linearise(*given, self._camera, self._config)
-
     def _cost(self, poses: Array, points: Array) -> float:
         """Half the sum of squared errors with Huber's kernel; infinite beyond all values."""
         total, config = self._factors.cost(poses[: self._count], points), self._config
-        with np.errstate(all="ignore"):
-            for rows in self._chunks():
-                squares = np.sum(self._parts(rows, poses, points)[0] ** 2, axis=1)
-                stereo = np.isfinite(self._observations.measurements[rows, 2])
-                k = np.where(stereo, config.huber_stereo, config.huber_mono)
-                # with the kernel's weight the squared error e^2 is k e beyond k
-                outer = config.robust & (squares > k**2)
-                total += float(np.sum(np.where(outer, squares - k**2 / 2, squares / 2)))
+        for rows in self._chunks():
+            squares = self._chi2(rows, poses, points)
+            k = np.where(self._stereo[rows], config.huber_stereo, config.huber_mono)
+            outer = config.robust & (squares > k**2)
+            total += float(np.sum(np.where(outer, k * np.sqrt(squares) - k**2 / 2, squares / 2)))
         return total if math.isfinite(total) else math.inf
+
+    def _chi2(self, rows: Ints, poses: Array, points: Array) -> Array:
+        """Squared errors (M,) of observations, without the kernel."""
+        given = self._observations.select(rows), poses[self._pose[rows]], points[self._point[rows]]
+        return reprojection(*given, self._camera)[1]
 
     def _linearised(self) -> _System:
         P, L = len(self.poses), len(self.points)
@@ -180,7 +180,9 @@ class _Problem:
         H_point, g_point = np.zeros((L, 3, 3)), np.zeros((L, 3))
         cross = np.zeros((len(self._pose), 6, 3))
         for rows in self._chunks():
-            r, J_pose, J_point = self._parts(rows, self.poses, self.points)
+            where = self.poses[self._pose[rows]], self.points[self._point[rows]]
+            given = self._observations.select(rows), *where, self._camera, self._config
+            r, J_pose, J_point = linearise(*given)
             to_pose, to_point = _sums(self._pose[rows], P), _sums(self._point[rows], L)
             J_pose_T, J_point_T = J_pose.swapaxes(1, 2), J_point.swapaxes(1, 2)
             cross[rows] = J_pose_T @ J_point
