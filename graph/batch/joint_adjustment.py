@@ -29,8 +29,8 @@ from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.graph.marginals.point_elimination import linearise
 from bmask_slam.graph.smoother.isam2 import SolverError
 
-CHUNK = 16384
-"""Observations that are linearised at once: a few megabytes."""
+CHUNK = 4096
+"""Observations that are linearised at once: some megabytes."""
 FIRST_DAMPING, LAST_DAMPING = 1e-5, 1e2
 MAX_STEPS = (5, 8)
 """Before and after the frames' outliers are left out."""
@@ -102,9 +102,11 @@ class _Problem:
     ) -> None:
         own, others = tables.observations.all(), frames.observations
         self._camera, self._config, self._count = camera, config, len(tables.keyframes.ids)
-        self._observations = concatenate([own, others])
         known = np.searchsorted(tables.keyframes.ids, own.keyframe_ids)
-        self._pose = np.concatenate([known, others.keyframe_ids + self._count])
+        pose = np.concatenate([known, others.keyframe_ids + self._count])
+        both = concatenate([own, others])
+        order = np.lexsort((both.landmark_ids, pose))
+        self._observations, self._pose = both.select(order), pose[order]
         self._point = np.searchsorted(tables.landmarks.ids, self._observations.landmark_ids)
         self.poses = np.concatenate([tables.keyframes.values, frames.poses_world_camera])
         self.points = tables.landmarks.values.copy()
@@ -135,16 +137,20 @@ class _Problem:
     def descend(self, max_steps: int) -> None:
         """Take steps until the cost hardly falls."""
         for _ in range(max_steps):
-            system = self._linearised()
             before = self.cost
-            while not self._step(system):
-                self._damping *= 10
-                if self._damping > LAST_DAMPING:
-                    return
-            self._damping = max(self._damping / 10, FIRST_DAMPING)
-            self.steps += 1
-            if before - self.cost <= self._config.least_decrease * before:
+            if not self._improve() or before - self.cost <= self._config.least_decrease * before:
                 return
+
+    def _improve(self) -> bool:
+        """Take a step by which the cost falls, with as much damping as that needs; False: none."""
+        system = self._linearised()
+        while not self._step(system):
+            self._damping *= 10
+            if self._damping > LAST_DAMPING:
+                return False
+        self._damping = max(self._damping / 10, FIRST_DAMPING)
+        self.steps += 1
+        return True
 
     def _step(self, system: _System) -> bool:
         """Take a step if the cost falls; whether it does."""
@@ -192,10 +198,7 @@ class _Problem:
             g_point += to_point @ (J_point_T @ r[:, :, None])[:, :, 0]
         A, b = self._factors.linearised(self.poses[: self._count], self.points, 6 * P)
         g_pose -= (A.T @ b).reshape(P, 6)
-        order = np.lexsort((self._point, self._pose))
-        return _System(
-            H_pose, g_pose, H_point, g_point, A, cross[order], self._pose[order], self._point[order]
-        )
+        return _System(H_pose, g_pose, H_point, g_point, A, cross, self._pose, self._point)
 
 
 def _chunks(count: int) -> list[Ints]:
@@ -212,8 +215,8 @@ def _sums(groups: Ints, count: int) -> csr_array:
 class _System:
     """Normal equations of poses and points at one place.
 
-    Blocks H_pose (P, 6, 6), H_point (L, 3, 3) and cross (M, 6, 3) with gradients (P, 6), (L, 3);
-    ``A`` (R, 6P) are the other factors.
+    Blocks H_pose (P, 6, 6), H_point (L, 3, 3) and cross (M, 6, 3), by pose and then point, with
+    gradients (P, 6), (L, 3); ``A`` (R, 6P) are the other factors.
     """
 
     H_pose: Array
@@ -230,7 +233,7 @@ class _System:
         P, L = len(self.H_pose), len(self.H_point)
         starts = np.searchsorted(self.pose, np.arange(P + 1))
         C = bsr_array((self.cross, self.point, starts), shape=(6 * P, 3 * L))
-        C_T = C.T.tocsr()
+        C_T = C.T
         damped = self.H_point * (1 + damping * np.eye(3)) + _POINT_FLOOR_PER_M2 * np.eye(3)
         inverse_point = np.asarray(np.linalg.inv(damped), float)
         H_pose = self.H_pose * (1 + damping * np.eye(6))
