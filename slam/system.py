@@ -17,6 +17,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.moving.moving_object_filter import MovingObjectFilter
 from bmask_slam.moving.static_features import StaticFeatures
+from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.runtime.stage_clock import stage
 from bmask_slam.semantics.segmenters.segmenter import Segmenter, begin_early
 from bmask_slam.sequences.frame import Frame, check_frame
@@ -146,6 +147,7 @@ class SlamSystem(SavedSystem):
     def _adjust_frames(self) -> None:
         """Adjust the whole map again with what other frames observe."""
         if self.config.adjust_frames:
+            give_back_memory()  # that the optimisation before took
             adjust_with_frames(self.mapper, self.frame_observations, self.config.graph)
 
     def _begin(self, frame: Frame) -> Frame:
