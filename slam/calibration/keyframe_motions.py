@@ -15,6 +15,7 @@ from bmask_slam.calibration.motion import twists_at
 from bmask_slam.calibration.views import frames_of
 from bmask_slam.features.brisk import FeatureConfig, sample_depth
 from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.world.frame_observations import FrameObservations
@@ -56,6 +57,18 @@ def frame_motions(
                 twist = _twist_of(view.timestamp_s, path)
                 motions[view.timestamp_s] = KeyframeMotion(twist, *change)
     return motions
+
+
+def motions_without_images(
+    frames: FrameObservations, paths: Mapping[int, Trajectory], old: Camera, new: Camera
+) -> dict[float, KeyframeMotion]:
+    """The motion of the other frames whose images are gone, by stamp.
+
+    None if the cameras differ in the delay of depth: what that does is not known without images.
+    """
+    if old.depth_time_offset_s != new.depth_time_offset_s:
+        return {}
+    return frame_motions(frames, paths, None)
 
 
 def _twist_of(stamp_s: float, path: Trajectory | None) -> Array:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bmask_slam.back_end.reinterpretation import KeyframeMotion
+from bmask_slam.calibration.keyframe_motions import motions_without_images
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
@@ -168,7 +169,10 @@ class LiveSystem(SlamSystem):
             answer = self.calibration.update(self.remote)
             if answer is not None:
                 if answer.camera is not None:
-                    self.use_camera(answer.camera, answer.motions)
+                    paths = self.remote.history.trajectories(self.remote.world)
+                    cameras = self.camera, answer.camera
+                    moved = motions_without_images(self.frame_observations, paths, *cameras)
+                    self.use_camera(answer.camera, answer.motions, moved)
                 self.events.calibration(self.calibration.text)
 
     def _follow_map(self, reference: Keyframe, T_before: Array) -> None:
