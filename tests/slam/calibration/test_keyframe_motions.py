@@ -1,4 +1,4 @@
-"""By what frames that are no keyframes are interpreted anew: the path's velocity at their stamps."""
+"""By what frames that are no keyframes are interpreted anew: their path's velocity."""
 
 from __future__ import annotations
 
