@@ -14,7 +14,13 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints, Mask, no_ids
-from bmask_slam.graph.factors.graph_update import PARTIAL, Observations, PosePrior, RelativePose
+from bmask_slam.graph.factors.graph_update import (
+    PARTIAL,
+    Observations,
+    PosePrior,
+    RelativePose,
+    concatenate,
+)
 from bmask_slam.graph.factors.marginalised_landmarks import MarginalisedLandmarks
 from bmask_slam.graph.inertial.tables import InertialTables
 
@@ -90,31 +96,30 @@ class ObservationTable:
         self._columns.measurements[rows] = observations.measurements
         self._columns.sigmas_px[rows] = observations.sigmas_px
         self._slots[rows] = NO_SLOT
-        pairs = zip(
-            observations.keyframe_ids.tolist(),
-            observations.landmark_ids.tolist(),
-            rows.tolist(),
-            strict=True,
-        )
-        for keyframe, landmark, row in pairs:
+        for (keyframe, landmark), row in zip(
+            observations.pairs.tolist(), rows.tolist(), strict=True
+        ):
             self.of_keyframe.setdefault(keyframe, {})[landmark] = row
             self.of_landmark.setdefault(landmark, {})[keyframe] = row
         return rows
 
     def remeasure(self, observations: Observations) -> None:
-        """Replace the measurements of those of the observations that are in the table."""
-        found = [self.row(*pair) for pair in observations.pairs.tolist()]
-        rows = np.array([-1 if row is None else row for row in found], np.int64)
-        self._columns.measurements[rows[rows >= 0]] = observations.measurements[rows >= 0]
+        """Replace the measurements of those of the observations that are in the table.
+
+        Of two of the same landmark in a keyframe the one nearer to the old measurement is meant.
+        One without depth gets none.
+        """
+        given = observations.pairs.tolist()
+        rows = np.array([-1 if (row := self.row(*pair)) is None else row for pair in given], int)
+        new, old = observations.measurements, self._columns.measurements[rows]
+        chosen = np.flatnonzero((rows >= 0) & (np.isfinite(old[:, 2]) | ~np.isfinite(new[:, 2])))
+        apart = np.abs(new - old)[chosen, :2].sum(axis=1)
+        chosen = chosen[np.argsort(-apart, kind="stable")]  # of those of a row the last counts
+        self._columns.measurements[rows[chosen]] = new[chosen]
 
     def remove(self, rows: Ints) -> None:
         """Remove rows; each must be in use."""
-        pairs = zip(
-            self._columns.keyframe_ids[rows].tolist(),
-            self._columns.landmark_ids[rows].tolist(),
-            strict=True,
-        )
-        for keyframe, landmark in pairs:
+        for keyframe, landmark in self._columns.select(rows).pairs.tolist():
             _discard(self.of_keyframe, keyframe, landmark)
             _discard(self.of_landmark, landmark, keyframe)
         self._free.extend(rows.tolist())
@@ -176,13 +181,8 @@ class ObservationTable:
 
     def _grow(self, capacity: int) -> None:
         more = capacity - len(self._slots)
-        old = self._columns
-        self._columns = Observations(
-            np.concatenate([old.keyframe_ids, np.zeros(more, np.int64)]),
-            np.concatenate([old.landmark_ids, np.zeros(more, np.int64)]),
-            np.concatenate([old.measurements, np.zeros((more, 3))]),
-            np.concatenate([old.sigmas_px, np.zeros((more, 3))]),
-        )
+        ids, columns = np.zeros(more, np.int64), np.zeros((more, 3))
+        self._columns = concatenate([self._columns, Observations(ids, ids, columns, columns)])
         self._slots = np.concatenate([self._slots, np.full(more, NO_SLOT, np.int64)])
 
 
