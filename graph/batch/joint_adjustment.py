@@ -19,6 +19,7 @@ from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.linalg import LinearOperator, cg
 
 from bmask_slam.graph.arrays import Array, Ints, Mask
+from bmask_slam.graph.batch.group_sums import GroupSums
 from bmask_slam.graph.batch.other_factors import OtherFactors
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import OBSERVATION_PROBABILITY, chi2_quantile, reprojection
@@ -26,7 +27,7 @@ from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations, concatenate
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.geometry import se3_exp
-from bmask_slam.graph.marginals.point_elimination import linearise
+from bmask_slam.graph.marginals.point_elimination import POINT_FLOOR_PER_M2, linearise
 from bmask_slam.graph.smoother.isam2 import SolverError
 
 CHUNK = 4096
@@ -35,8 +36,6 @@ FIRST_DAMPING, LAST_DAMPING = 1e-5, 1e2
 MAX_STEPS = (5, 8)
 """Before and after the frames' outliers are left out."""
 CG_STEPS, CG_TOLERANCE = 150, 3e-3
-_POINT_FLOOR_PER_M2 = 1e-6
-"""Information added to each point, that of a sigma of 1 km, so that it is invertible."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,10 +117,11 @@ class _Problem:
         """Leave out observations of frames beyond their bound; returns their number."""
         bound = chi2_quantile(OBSERVATION_PROBABILITY, np.where(self._stereo, 3, 2))
         kept = np.ones(len(bound), bool)
-        for rows in self._chunks():
+        for rows in _chunks(len(self._pose)):
             kept[rows] = self._chi2(rows, self.poses, self.points) <= bound[rows]
         kept |= self._pose < self._count
-        self._keep(kept)
+        self._observations = self._observations.select(kept)
+        self._pose, self._point = self._pose[kept], self._point[kept]
         self.cost = self._cost(self.poses, self.points)
         return int(np.count_nonzero(~kept))
 
@@ -129,10 +129,6 @@ class _Problem:
     def _stereo(self) -> Mask:
         """(M,) which observations have depth."""
         return np.isfinite(self._observations.measurements[:, 2])
-
-    def _keep(self, kept: Mask) -> None:
-        self._observations = self._observations.select(kept)
-        self._pose, self._point = self._pose[kept], self._point[kept]
 
     def descend(self, max_steps: int) -> None:
         """Take steps until the cost hardly falls."""
@@ -162,13 +158,10 @@ class _Problem:
         self.poses, self.points, self.cost = poses, points, cost
         return True
 
-    def _chunks(self) -> list[Ints]:
-        return _chunks(len(self._pose))
-
     def _cost(self, poses: Array, points: Array) -> float:
         """Half the sum of squared errors with Huber's kernel; infinite beyond all values."""
         total, config = self._factors.cost(poses[: self._count], points), self._config
-        for rows in self._chunks():
+        for rows in _chunks(len(self._pose)):
             squares = self._chi2(rows, poses, points)
             k = np.where(self._stereo[rows], config.huber_stereo, config.huber_mono)
             outer = config.robust & (squares > k**2)
@@ -185,17 +178,17 @@ class _Problem:
         H_pose, g_pose = np.zeros((P, 6, 6)), np.zeros((P, 6))
         H_point, g_point = np.zeros((L, 3, 3)), np.zeros((L, 3))
         cross = np.zeros((len(self._pose), 6, 3))
-        for rows in self._chunks():
+        for rows in _chunks(len(self._pose)):
             where = self.poses[self._pose[rows]], self.points[self._point[rows]]
             given = self._observations.select(rows), *where, self._camera, self._config
             r, J_pose, J_point = linearise(*given)
-            to_pose, to_point = _sums(self._pose[rows], P), _sums(self._point[rows], L)
+            of_poses, of_points = GroupSums(self._pose[rows], P), GroupSums(self._point[rows], L)
             J_pose_T, J_point_T = J_pose.swapaxes(1, 2), J_point.swapaxes(1, 2)
             cross[rows] = J_pose_T @ J_point
-            H_pose += (to_pose @ (J_pose_T @ J_pose).reshape(-1, 36)).reshape(P, 6, 6)
-            H_point += (to_point @ (J_point_T @ J_point).reshape(-1, 9)).reshape(L, 3, 3)
-            g_pose += to_pose @ (J_pose_T @ r[:, :, None])[:, :, 0]
-            g_point += to_point @ (J_point_T @ r[:, :, None])[:, :, 0]
+            H_pose += of_poses(J_pose_T @ J_pose)
+            H_point += of_points(J_point_T @ J_point)
+            g_pose += of_poses((J_pose_T @ r[:, :, None])[:, :, 0])
+            g_point += of_points((J_point_T @ r[:, :, None])[:, :, 0])
         A, b = self._factors.linearised(self.poses[: self._count], self.points, 6 * P)
         g_pose -= (A.T @ b).reshape(P, 6)
         return _System(H_pose, g_pose, H_point, g_point, A, cross, self._pose, self._point)
@@ -204,11 +197,6 @@ class _Problem:
 def _chunks(count: int) -> list[Ints]:
     """Rows 0 to count - 1, CHUNK at a time."""
     return np.split(np.arange(count), range(CHUNK, count, CHUNK))
-
-
-def _sums(groups: Ints, count: int) -> csr_array:
-    """A matrix (count, M) that adds up the rows (M, n) of each group (M,)."""
-    return csr_array((np.ones(len(groups)), (groups, np.arange(len(groups)))), (count, len(groups)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +222,7 @@ class _System:
         starts = np.searchsorted(self.pose, np.arange(P + 1))
         C = bsr_array((self.cross, self.point, starts), shape=(6 * P, 3 * L))
         C_T = C.T
-        damped = self.H_point * (1 + damping * np.eye(3)) + _POINT_FLOOR_PER_M2 * np.eye(3)
+        damped = self.H_point * (1 + damping * np.eye(3)) + POINT_FLOOR_PER_M2 * np.eye(3)
         inverse_point = np.asarray(np.linalg.inv(damped), float)
         H_pose = self.H_pose * (1 + damping * np.eye(6))
 
@@ -259,8 +247,7 @@ class _System:
         for rows in _chunks(len(self.pose)):
             cross = self.cross[rows]
             known = cross @ inverse_point[self.point[rows]] @ cross.swapaxes(1, 2)
-            to_pose = _sums(self.pose[rows], len(blocks))
-            blocks -= (to_pose @ known.reshape(-1, 36)).reshape(blocks.shape)
+            blocks -= GroupSums(self.pose[rows], len(blocks))(known)
         squares = np.asarray(self.A.multiply(self.A).sum(axis=0)).reshape(-1, 6)
         blocks[:, range(6), range(6)] += squares
         return np.asarray(np.linalg.inv(blocks), float)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import bsr_array, csr_array
+from scipy.sparse import bsr_array
 
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.batch.group_sums import GroupSums
 from bmask_slam.graph.calibration.model import CalibrationViews, linearise
 from bmask_slam.graph.calibration.problem import CalibrationProblem, CalibrationState, N, add_priors
 
@@ -36,7 +37,7 @@ def normal_equations(
     r, J_c, J_l, J_k = (
         lin.residuals * root[..., 0], lin.pose * root, lin.point * root, lin.calibration * root,
     )  # fmt: skip
-    of_landmarks, of_keyframes = _Sums(views.landmarks, L), _Sums(views.keyframes, K)
+    of_landmarks, of_keyframes = GroupSums(views.landmarks, L), GroupSums(views.keyframes, K)
     H_ll = of_landmarks(J_l.swapaxes(1, 2) @ J_l)
     g_l = of_landmarks(np.einsum("mri,mr->mi", J_l, r))
     inverse_ll = inverse_information(_damped(H_ll, damping))
@@ -60,18 +61,6 @@ def normal_equations(
     b = np.concatenate([b_c.ravel(), b_k])
     add_priors(problem, state, S, b)
     return Reduced(S, b, inverse_ll, g_l, cross_c, cross_k)
-
-
-class _Sums:
-    """Adds up rows (M, ...) of the same group, one of ``count`` for each row (M,)."""
-
-    def __init__(self, groups: Ints, count: int) -> None:
-        rows = np.arange(len(groups))
-        self._chosen = csr_array((np.ones(len(rows)), (groups, rows)), shape=(count, len(rows)))
-
-    def __call__(self, rows: Array) -> Array:
-        sums = self._chosen @ rows.reshape(len(rows), -1)
-        return np.asarray(sums).reshape(-1, *rows.shape[1:])
 
 
 def inverse_information(H: Array) -> Array:

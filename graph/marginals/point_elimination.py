@@ -19,7 +19,7 @@ from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.geometry import inverse, skew
 
-_POINT_FLOOR_PER_M2 = 1e-6
+POINT_FLOOR_PER_M2 = 1e-6
 """Information added to each point, that of a sigma of 1 km, so that it is invertible."""
 
 
@@ -124,7 +124,7 @@ def eliminate_points(
     np.add.at(H_point, column, J_point_T @ J_point)
     g_point = np.zeros((points_count, 3))
     np.add.at(g_point, column, (J_point_T @ r[:, :, None])[:, :, 0])
-    covariances = np.asarray(np.linalg.inv(H_point + _POINT_FLOOR_PER_M2 * np.eye(3)), float)
+    covariances = np.asarray(np.linalg.inv(H_point + POINT_FLOOR_PER_M2 * np.eye(3)), float)
     diagonal = np.zeros((count, 6, 6))
     np.add.at(diagonal, row, J_pose_T @ J_pose)
     g = np.zeros((count, 6))

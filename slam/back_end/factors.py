@@ -52,9 +52,16 @@ def observations_of(
     keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints, depth_factor: float = 1.0
 ) -> Observations:
     """The graph's observations of some keypoints of a keyframe."""
-    features = keyframe.features
+    given = keyframe.id, keyframe.features, keypoints, landmark_ids
+    return observations_in(*given, depth_factor)
+
+
+def observations_in(
+    number: int, features: Features, keypoints: Ints, landmark_ids: Ints, depth_factor: float
+) -> Observations:
+    """The same of the features of a frame, which is keyframe ``number`` in them."""
     return Observations(
-        keyframe_ids=np.full(len(keypoints), keyframe.id),
+        keyframe_ids=np.full(len(keypoints), number),
         landmark_ids=landmark_ids,
         measurements=stereo_measurements(features, keypoints),
         sigmas_px=quantised(features.sigmas_px[keypoints] * [1.0, 1.0, depth_factor]),

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from bmask_slam.back_end.factor_selection import read_back
-from bmask_slam.back_end.factors import quantised, stereo_measurements
+from bmask_slam.back_end.factors import observations_in
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.batch.joint_adjustment import Frames, adjust_jointly
@@ -66,7 +66,7 @@ def frames_in(
     count as much as the keyframes: their sigmas are larger by the root of how many more they are.
     None if graph and frames have more observations than ``MAX_OBSERVATIONS``.
     """
-    known, weights = tables.landmarks, np.array([1.0, 1.0, camera.graph_depth_factor])
+    known, bf, depth_factor = tables.landmarks, camera.stereo_bf_px_m, camera.graph_depth_factor
     parts: list[Observations] = []
     poses: list[Array] = []
     stamps_s: list[float] = []
@@ -79,10 +79,7 @@ def frames_in(
         ids, rows = ids[in_graph], rows[in_graph]
         if len(ids) < MIN_LANDMARKS:
             continue
-        features = view.features(camera.stereo_bf_px_m)
-        sigmas_px = quantised(features.sigmas_px[rows] * weights)
-        frame, measured = np.full(len(ids), len(poses)), stereo_measurements(features, rows)
-        parts.append(Observations(frame, ids, measured, sigmas_px))
+        parts.append(observations_in(len(poses), view.features(bf), rows, ids, depth_factor))
         poses.append(pose)
         stamps_s.append(view.timestamp_s)
     if not parts or sum(map(len, parts)) + len(tables.observations) > MAX_OBSERVATIONS:

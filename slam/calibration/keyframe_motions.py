@@ -50,12 +50,12 @@ def frame_motions(
     motions = {}
     for path in paths.values():
         known = set(path.timestamps_s.tolist())
-        for view in frames.views:
-            if view.timestamp_s in known:
-                pixels = view.columns[:, 2:4].astype(float)
-                change = depth_change(view.timestamp_s, pixels) if depth_change else ()
-                twist = _twist_of(view.timestamp_s, path)
-                motions[view.timestamp_s] = KeyframeMotion(twist, *change)
+        views = [view for view in frames.views if view.timestamp_s in known]
+        twists = twists_at(path, np.array([view.timestamp_s for view in views]))
+        for view, twist in zip(views, twists, strict=True):
+            pixels = view.columns[:, 2:4].astype(float)
+            change = depth_change(view.timestamp_s, pixels) if depth_change else ()
+            motions[view.timestamp_s] = KeyframeMotion(twist, *change)
     return motions
 
 

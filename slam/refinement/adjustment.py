@@ -18,9 +18,11 @@ from bmask_slam.evaluation import (
 )
 from bmask_slam.evaluation.plot import plot_trajectory
 from bmask_slam.events import EVENTS, read_events
+from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment, AdjustmentConfig, Stage, adjust
 from bmask_slam.graph.batch.iteration import Progress
 from bmask_slam.graph.batch.joint_adjustment import adjust_jointly
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import fitting, part
 from bmask_slam.graph.files.ply import write_ply
@@ -110,34 +112,30 @@ def adjust_run(
             adjustment = adjust(run.tables, run.camera, run.config, config, progress)
         except InputError as error:
             raise InputError(f"{path / 'graph'}: {error}") from error
-        frames = _with_frames(run)
-        trajectory = _write_run(run, before, adjustment, folder)
+        saved = read_map(path) if (path / MAP).is_file() else None
+        frames = _with_frames(run, saved[0]) if saved else None
+        trajectory = _write_run(run, before, adjustment, folder, saved)
         given, errors = run.trajectories["trajectory.txt"], None
         if truth is not None:
             errors = (evaluate_trajectory(given, truth), evaluate_trajectory(trajectory, truth))
-        after = GraphSnapshot.of(run.tables)
-        done = adjustment, frames, after, errors
+        done = adjustment, frames, GraphSnapshot.of(run.tables), errors
         result = RunAdjustment(folder.path, *done, plot or out / PICTURE)
         folder.write_text("metrics.json", format_json(result_rows(result)))
         picture = folder.path / "trajectory.png"
         plot_trajectory(picture, trajectory, truth, folder.path.name, read_events(path))
-        draw_adjustment(result.picture, before, after, adjustment)
+        draw_adjustment(result.picture, before, result.graph, adjustment)
         return result
 
 
-def _with_frames(run: SavedRun) -> Stage | None:
+def _with_frames(run: SavedRun, state: Arrays) -> Stage | None:
     """Adjust the graph with what frames observe that are no keyframes; None if that is not known.
 
     As at the end of a run (`slam.back_end.frame_adjustment`).
     """
-    file, frames = run.path / MAP, FrameObservations()
-    if not file.is_file():
-        return None
-    state, _ = read_map(run.path)
-    saved = part(state, "frames")
+    saved, frames = part(state, "frames"), FrameObservations()
     if not saved:  # of a version that did not keep them
         return None
-    with fitting(file):
+    with fitting(run.path / MAP):
         frames.restore(saved)
         world = world_of(part(part(state, "mapper"), "world"))
         paths = run.trajectories.values()
@@ -154,9 +152,16 @@ def _with_frames(run: SavedRun) -> Stage | None:
 
 
 def _write_run(
-    run: SavedRun, before: GraphSnapshot, adjustment: Adjustment, folder: RunFolder
+    run: SavedRun,
+    before: GraphSnapshot,
+    adjustment: Adjustment,
+    folder: RunFolder,
+    saved: tuple[Arrays, Camera] | None,
 ) -> Trajectory:
-    """Write the adjusted run, but for figures and pictures; returns its trajectory."""
+    """Write the adjusted run, but for figures and pictures; returns its trajectory.
+
+    ``saved`` are state and camera of its map, if it has one.
+    """
     stamps_s, poses_before = run.keyframe_stamps_s, before.poses_world_camera
     poses_after = run.tables.keyframes.get(before.keyframe_ids)
     moved = {
@@ -173,8 +178,8 @@ def _write_run(
     write_ply(folder.path / "landmarks.ply", columns, LANDMARKS_COMMENT)
     with whole_file(folder.path / "graph") as graph:
         write_graph(graph, run.tables, run.camera)
-    if (run.path / MAP).is_file():
-        state, camera = read_map(run.path)
+    if saved:
+        state, camera = saved
         state = adjusted_map(state, run.tables, adjustment, camera, run.path / MAP)
         with whole_file(folder.path / MAP) as file:
             write_map(file, state, camera)
