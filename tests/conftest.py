@@ -18,7 +18,7 @@ import pytest
 
 if TYPE_CHECKING:
     from bmask_slam.graph.camera import Camera
-    from bmask_slam.rendering.sequence import RenderConfig
+    from bmask_slam.rendering.config import RenderConfig
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
@@ -75,7 +75,7 @@ def rendered(
 @pytest.fixture(scope="session")
 def office(rendered: Callable[[RenderConfig], Path]) -> Path:
     """The first half second of the rendered office in small images, with the true depth."""
-    from bmask_slam.rendering.sequence import RenderConfig
+    from bmask_slam.rendering.config import RenderConfig
 
     return rendered(RenderConfig("office", frames=15, width=160, height=120, true_depth=True))
 
@@ -86,7 +86,7 @@ SLOW_OFFICE_FRAMES = 60
 @pytest.fixture(scope="session")
 def slow_office(rendered: Callable[[RenderConfig], Path]) -> Path:
     """Seven and a half seconds of the office at 8 Hz, in small images."""
-    from bmask_slam.rendering.sequence import RenderConfig
+    from bmask_slam.rendering.config import RenderConfig
 
     return rendered(RenderConfig("office", SLOW_OFFICE_FRAMES, fps=8.0, width=160, height=120))
 
@@ -110,7 +110,7 @@ SWEEP_DELAY_S = 0.016
 @pytest.fixture(scope="session")
 def late_sweep(rendered: Callable[[RenderConfig], Path]) -> Path:
     """Eight seconds of the office by a sweeping camera; depth is late, which camera.yaml omits."""
-    from bmask_slam.rendering.sequence import RenderConfig
+    from bmask_slam.rendering.config import RenderConfig
 
     late_ms = 1e3 * SWEEP_DELAY_S
     config = RenderConfig(

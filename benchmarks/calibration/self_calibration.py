@@ -29,7 +29,8 @@ from bmask_slam.evaluation import evaluate
 from bmask_slam.graph.calibration.model import PARAMETERS, parameters_of
 from bmask_slam.graph.camera import Camera
 from bmask_slam.offline.runner import RunOptions, run
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.rendering.config import RenderConfig
+from bmask_slam.rendering.sequence import render_sequence
 from bmask_slam.sequences.cameras import read_camera, write_camera
 from bmask_slam.system_config import SystemConfig
 

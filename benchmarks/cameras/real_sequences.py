@@ -20,7 +20,7 @@ import json
 import re
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from benchmarks.cameras.tables import (
     DELAY_MS,
     LIBRARIES,
     OURS,
-    READOUT_S,
+    READOUT_MS,
     RECORDINGS,
     SHORT,
     Figures,
@@ -45,10 +45,8 @@ from benchmarks.cameras.tables import (
 from benchmarks.machine import describe_commit, now
 from benchmarks.pages import WRITTEN, fill_block
 from benchmarks.paths import KITCHEN, ROOT, SHARED
-from benchmarks.suite.hard_sequences import Hardship, make_hard
 from benchmarks.suite.measure import call, render
 from bmask_slam.evaluation import evaluate
-from bmask_slam.sequences.cameras import read_camera, write_camera
 
 FOLDERS = {
     "rpy": SHARED / "tum_fr1_rpy", "rpy-none": SHARED / "tum_fr1_rpy",
@@ -68,9 +66,11 @@ def folder_of(name: str, work: Path) -> Path:
         return FOLDERS[name]
     if name == "rpy-unknown":
         return _unnamed(FOLDERS["rpy"], work / "recording")
-    office = work / "office-300"
-    render(office, "office", ("--frames", "300", "--true-depth"))
-    return office if name == "office" else _rolling(work)
+    late = ("--rolling-shutter-ms", f"{READOUT_MS}", "--depth-delay-ms", f"{DELAY_MS}")
+    options = ("--true-depth",) if name == "office" else late
+    office = work / ("office-300" if name == "office" else name)
+    render(office, "office", ("--frames", "300", *options))
+    return office
 
 
 def _unnamed(source: Path, folder: Path) -> Path:
@@ -80,21 +80,6 @@ def _unnamed(source: Path, folder: Path) -> Path:
         if not (folder / part).exists():
             (folder / part).symlink_to(source.resolve() / part)
     return folder
-
-
-def _rolling(work: Path) -> Path:
-    """The office with rows exposed in turn and late depth; its camera.yaml says nothing of it."""
-    out = work / "office-rolling"
-    if not out.is_dir():
-        late = work / "office-late"
-        if not late.is_dir():
-            from bmask_slam.rendering.sequence import RenderConfig, render_sequence  # noqa: PLC0415
-
-            render_sequence(RenderConfig("office", 300, depth_delay_ms=DELAY_MS), late)
-        make_hard(late, Hardship(readout_s=READOUT_S), out)
-        camera = read_camera(out / "camera.yaml")
-        write_camera(out / "camera.yaml", replace(camera, rolling_shutter_s=0.0))
-    return out
 
 
 def measured(name: str, work: Path) -> Figures:

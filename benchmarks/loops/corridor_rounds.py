@@ -18,7 +18,8 @@ import numpy as np
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.offline.runner import RunOptions, run
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.rendering.config import RenderConfig
+from bmask_slam.rendering.sequence import render_sequence
 from bmask_slam.system_config import SystemConfig
 
 TITLES = ("rounds", "frames", "path m", "ATE without", "ATE closed", "ratio", "RPE/s", "RPE/s")

@@ -38,7 +38,8 @@ from bmask_slam.dense.saved_map import MappedRun, open_run
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.offline.runner import run
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.rendering.config import RenderConfig
+from bmask_slam.rendering.sequence import render_sequence
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 
 ROOMS, FRAMES = "office,living_room", 150

@@ -36,7 +36,8 @@ from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.moving.static_features import FeatureReplenishment, StaticFeatures
 from bmask_slam.offline.runner import RunOptions, run
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.rendering.config import RenderConfig
+from bmask_slam.rendering.sequence import render_sequence
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig

@@ -24,7 +24,8 @@ from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.trajectory import associate_stamps, read_tum
 from bmask_slam.offline.runner import RunOptions, run
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.rendering.config import RenderConfig
+from bmask_slam.rendering.sequence import render_sequence
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.system_config import SystemConfig
 

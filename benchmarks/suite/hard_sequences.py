@@ -1,4 +1,4 @@
-"""Hard inputs from recorded and rendered sequences: faster, blurred, with rolling shutter.
+"""Hard inputs from recorded and rendered sequences: faster and blurred.
 
 They are written as folders in TUM layout.
 """
@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Floats, Image
-from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.trajectory import Trajectory, associate_stamps, write_tum
 from bmask_slam.rendering.engine.sensor import blur, optical_flow
@@ -21,7 +20,6 @@ from bmask_slam.rendering.writer import new_folder, stored_depth, write_png
 from bmask_slam.sequences.cameras import write_camera
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.sequences.sequence import Sequence, open_sequence
-from bmask_slam.tracking.rolling_shutter import share_of_rows
 
 BURST, PAUSE = 12, 18
 """Numbers of consecutive frames that are blurred by a box, and that are not."""
@@ -36,16 +34,14 @@ class Hardship:
         max_frames: of those that are kept.
         shutter: blur along the image motion, as a share of the motion to the next kept frame.
         box_px: side of a box that blurs BURST frames in every BURST + PAUSE.
-        readout_s: rolling shutter, of a rendered sequence only; written to the new camera.yaml.
-        restamp: give the kept frames the original frame rate, so that the camera moves faster.
+        fps: frame rate [Hz] that the kept frames get, so that the camera moves faster.
     """
 
     stride: int = 1
     max_frames: int | None = None
     shutter: float = 0.0
     box_px: int = 0
-    readout_s: float = 0.0
-    restamp: bool = False
+    fps: float | None = None
 
 
 def make_hard(source: Path, hardship: Hardship, out: Path) -> Path:
@@ -55,11 +51,10 @@ def make_hard(source: Path, hardship: Hardship, out: Path) -> Path:
     sequence = open_sequence(source)
     kept = list(range(0, len(sequence), hardship.stride))[: hardship.max_frames]
     stamps_s = sequence.timestamps_s[kept]
-    if hardship.restamp:
-        stamps_s = stamps_s[0] + np.arange(len(kept)) / sequence.camera.fps
     camera = sequence.camera
-    if hardship.readout_s:
-        camera = replace(camera, rolling_shutter_s=hardship.readout_s)
+    if hardship.fps:
+        stamps_s = stamps_s[0] + np.arange(len(kept)) / hardship.fps
+        camera = replace(camera, fps=hardship.fps)
     names = [f"{stamp:.6f}.png" for stamp in stamps_s]
     with new_folder(out) as folder:
         for name, frame in zip(names, _disturbed(sequence, kept, hardship), strict=True):
@@ -79,33 +74,18 @@ def make_hard(source: Path, hardship: Hardship, out: Path) -> Path:
 
 
 def _disturbed(sequence: Sequence, kept: list[int], hardship: Hardship) -> Iterator[Frame]:
-    """The kept frames with blur and rolling shutter."""
+    """The kept frames with blur."""
     for k, index in enumerate(kept):
         frame = sequence.load(index)
         if hardship.box_px and k % (BURST + PAUSE) >= PAUSE:
             side = (hardship.box_px, hardship.box_px)
             frame = replace(frame, rgb=cv2.blur(frame.rgb, side))
-        if hardship.shutter or hardship.readout_s:
+        if hardship.shutter:
             other = kept[k + 1] if k + 1 < len(kept) else kept[k - 1]
             flow = _flow(sequence, frame, other) * np.float32(1 if other > index else -1)
-            frame = _moved(frame, flow, hardship, sequence.camera)
+            blurred = blur(frame.rgb.astype(np.float32), hardship.shutter * flow)
+            frame = replace(frame, rgb=np.rint(blurred).astype(np.uint8))
         yield frame
-
-
-def _moved(frame: Frame, flow: Floats, hardship: Hardship, camera: Camera) -> Frame:
-    """A frame blurred along a flow (H, W, 2) px an interval, each row at its own time."""
-    rgb, depth_m = frame.rgb, frame.depth_m
-    if hardship.readout_s:
-        height, width = depth_m.shape
-        v, u = np.mgrid[:height, :width].astype(np.float32)
-        intervals = hardship.readout_s * camera.fps * share_of_rows(v, camera)
-        u, v = u - intervals * flow[..., 0], v - intervals * flow[..., 1]
-        u, v = u.astype(np.float32), v.astype(np.float32)
-        rgb = cv2.remap(rgb, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
-        depth_m = cv2.remap(depth_m, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_REPLICATE)
-    if hardship.shutter:
-        rgb = np.rint(blur(rgb.astype(np.float32), hardship.shutter * flow)).astype(np.uint8)
-    return replace(frame, rgb=rgb, depth_m=depth_m)
 
 
 def _flow(sequence: Sequence, frame: Frame, other: int) -> Floats:

@@ -31,7 +31,8 @@ from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import evaluate
 from bmask_slam.graph.errors import InputError
 from bmask_slam.offline.runner import RunOptions, run
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.rendering.config import RenderConfig
+from bmask_slam.rendering.sequence import render_sequence
 from bmask_slam.sequences.cameras import read_camera, write_camera
 from bmask_slam.system_config import SystemConfig
 
@@ -53,13 +54,24 @@ class Input:
     hand_eye: bool = False
 
 
-RENDERED = {
-    "office-300": RenderConfig("office", frames=300),
-    "living_room-360": RenderConfig("living_room", frames=360),
-    "room7-360": RenderConfig("room", frames=360, seed=7),
+def fast(config: RenderConfig, speed: int) -> RenderConfig:
+    """A scene whose images, given out at the rate of the slow one, show so fast a camera."""
+    shutter_ms = 1e3 * READOUT_S * speed
+    frames = None if config.frames is None else config.frames // speed
+    return replace(config, frames=frames, fps=config.fps / speed, rolling_shutter_ms=shutter_ms)
+
+
+READOUT_S = 0.02
+SLOW = {
+    "office": RenderConfig("office", frames=300),
+    "living_room": RenderConfig("living_room", frames=360),
+    "room7": RenderConfig("room", frames=360, seed=7),
 }
+FAST = {
+    f"{name}-x{speed}": fast(config, speed) for name, config in SLOW.items() for speed in (2, 3)
+}
+RENDERED = {"office": SLOW["office"], **FAST}
 """Rendered sources; all others are recordings."""
-FAST = Hardship(shutter=0.5, readout_s=0.02, restamp=True)
 INPUTS = {
     "rpy": Input("tum_fr1_rpy", timing=KINECT_V1),
     "rpy-x2": Input("tum_fr1_rpy", stride=2, timing=KINECT_V1),
@@ -69,12 +81,11 @@ INPUTS = {
     "kitchen-x3-blur": Input("redkitchen", Hardship(stride=3, shutter=0.6), hand_eye=True),
     "kitchen-box": Input("redkitchen", Hardship(max_frames=200, box_px=11), hand_eye=True),
     **{
-        f"{source.split('-')[0]}-x{speed}": Input(source, replace(FAST, stride=speed))
-        for source in RENDERED
-        for speed in (2, 3)
+        name: Input(name, Hardship(shutter=0.5, fps=30.0), timing={"rolling_shutter_s": READOUT_S})
+        for name in FAST
     },
     "kitchen": Input("redkitchen", hand_eye=True),
-    "office": Input("office-300"),
+    "office": Input("office"),
 }
 
 
@@ -97,7 +108,7 @@ def sequence_of(entry: Input, into: Path) -> Path:
         InputError: its recording is not there.
     """
     if entry.source in RENDERED:
-        source = into / entry.source
+        source = into / f"rendered-{entry.source}"
         if not source.is_dir():
             render_sequence(RENDERED[entry.source], source)
     else:
@@ -107,11 +118,8 @@ def sequence_of(entry: Input, into: Path) -> Path:
     if entry.hardship is None:
         return source
     done = entry.hardship
-    name = (
-        f"{entry.source}-{done.stride}-{done.max_frames}-{done.shutter}-{done.box_px}"
-        f"-{done.readout_s}-{done.restamp}"
-    )
-    return make_hard(source, done, into / name)
+    parts = entry.source, done.stride, done.max_frames, done.shutter, done.box_px, done.fps
+    return make_hard(source, done, into / "-".join(map(str, parts)))
 
 
 def outcome(entry: Input, sequence: Path, settings: list[str]) -> Outcome:

@@ -27,7 +27,8 @@ from bmask_slam.calibration.camera_check import check_camera
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.camera import Camera
 from bmask_slam.offline.runner import RunOptions, run
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.rendering.config import RenderConfig
+from bmask_slam.rendering.sequence import render_sequence
 from bmask_slam.run_folder.map_file import read_run
 from bmask_slam.sequences.cameras import read_camera, write_camera
 from bmask_slam.sequences.sequence import open_sequence

@@ -51,6 +51,8 @@ def add_render(commands: Commands) -> None:
     parser.add_argument(
         "--depth-delay-ms", type=float, default=0.0, metavar="MS", help="depth taken so much later"
     )
+    text = "rows exposed in turn over so long, the middle at the stamp"
+    parser.add_argument("--rolling-shutter-ms", type=float, default=0.0, metavar="MS", help=text)
     parser.add_argument("--sweeping", action="store_true", help="tilt and roll, as to calibrate")
     text = (
         "also odometry,position,accelerometer,imu: files beside the images; markers: on the walls"
@@ -62,7 +64,8 @@ def add_render(commands: Commands) -> None:
 
 
 def _render(arguments: argparse.Namespace) -> int:
-    from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+    from bmask_slam.rendering.config import RenderConfig
+    from bmask_slam.rendering.sequence import render_sequence
     from bmask_slam.runtime.progress import counting_bar
 
     names = (f.name for f in fields(RenderConfig) if f.name != "noise")

@@ -16,7 +16,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.errors import InputError, did_you_mean
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.mapping.open3d_loader import load_open3d
 from bmask_slam.rendering.annotations import (
@@ -26,86 +26,22 @@ from bmask_slam.rendering.annotations import (
     true_boxes,
     visible_instances,
 )
+from bmask_slam.rendering.config import CLOSED, RenderConfig, check_config, kinect_camera
 from bmask_slam.rendering.engine.builder import SceneBuilder
 from bmask_slam.rendering.engine.lighting import Lighting
-from bmask_slam.rendering.engine.path import CameraPath, camera_poses
+from bmask_slam.rendering.engine.path import CameraPath, camera_poses, poses_at
 from bmask_slam.rendering.engine.raycast import Geometry, Renderer, View, to_image
 from bmask_slam.rendering.engine.scene import Scene, build_scene
 from bmask_slam.rendering.engine.sensor import blur, exposure_gain, measure_depth, optical_flow
 from bmask_slam.rendering.markers import PlacedMarker, add_markers, write_truth
 from bmask_slam.rendering.rooms.random_room import draw_room
-from bmask_slam.rendering.sensors import MARKERS, check_sensors, write_sensors
+from bmask_slam.rendering.sensors import MARKERS, write_sensors
 from bmask_slam.rendering.things.people import Cast, Role, add_people
 from bmask_slam.rendering.writer import new_folder, stored_depth, write_json, write_lists, write_png
 from bmask_slam.sequences.cameras import write_camera
-
-SCENES: dict[str, str] = {
-    "office": "an office for three with desks, computers and bookcases; one round through it",
-    "busy_office": "the same office from the door side, with room for people to walk before it",
-    "crowded_office": "the busy office with people who walk along close before the camera",
-    "living_room": "a living room with sofa, television, dining table and bookcase; one round",
-    "corridor": "a square corridor, a loop of 30 m that ends where it began",
-    "building": "three storeys of look-alike rooms along corridors, 626 m; 13 minutes of walking",
-    "room": "a room drawn at random from the seed: size, walls, light, furniture and round",
-}
-"""Names and one-line descriptions of the scenes."""
-CLOSED = ("corridor",)
-"""Scenes whose path ends where it began: it can be walked more than once."""
+from bmask_slam.tracking.rolling_shutter import exposed_after_s
 
 _WORKERS, _SHUTTER_SHARE, _IMAGE_NOISE = 2, 0.6, 2.0
-
-
-@dataclass(frozen=True)
-class RenderConfig:
-    """What to render; equal configurations give equal bytes.
-
-    Attributes:
-        name: one of SCENES.
-        frames: number of frames from the start of the path; None for the whole path.
-        rounds: how often the path is walked; more than once in a scene of CLOSED only.
-        seed: of people, noise, textures and the hand's tremor, and of a random room.
-        people: how many people stand, sit, walk and carry things in the scene.
-        carry: the first of them carries a box without a class, and pulls a chair for a while.
-        noise: apply the Kinect's depth noise and holes, and image noise of 2 grey levels.
-        exposure_change: let the brightness vary slowly.
-        motion_blur: blur along the image motion while the shutter is open.
-        fps: frame rate in hertz.
-        depth_delay_ms: take each depth image so much later than the colour image whose stamp
-            it gets; ``camera.yaml`` does not say so.
-        sweeping: add tilt, pan, roll and translation to the path, as for a calibration.
-        width, height: image size in pixels; the field of view stays the Kinect's.
-        true_depth: also write the noise-free depth to ``depth_true/``.
-        normals: also write camera-frame normals to ``normals/`` as round(127.5 n + 127.5).
-        sensors: also write the files of "odometry", "position", "accelerometer", "imu"; "markers":
-            hang markers on the walls.
-    """
-
-    name: str
-    frames: int | None = None
-    seed: int = 0
-    people: int = 0
-    carry: bool = False
-    noise: bool = True
-    exposure_change: bool = False
-    motion_blur: bool = False
-    fps: float = 30.0
-    depth_delay_ms: float = 0.0
-    sweeping: bool = False
-    width: int = 640
-    height: int = 480
-    true_depth: bool = False
-    normals: bool = False
-    rounds: int = 1
-    sensors: tuple[str, ...] = ()
-
-
-def kinect_camera(config: RenderConfig) -> Camera:
-    """A Kinect's intrinsics, scaled to the image size by (u + 0.5) s - 0.5."""
-    sx, sy = config.width / 640, config.height / 480
-    return Camera(
-        config.width, config.height, fx=525.0 * sx, fy=525.0 * sy,
-        cx=320.0 * sx - 0.5, cy=240.0 * sy - 0.5, fps=config.fps, stereo_bf_px_m=40.0 * sx,
-    )  # fmt: skip
 
 
 def render_sequence(
@@ -118,7 +54,7 @@ def render_sequence(
     Raises:
         InputError: unknown scene, impossible number, or ``out`` not empty or not writable.
     """
-    _check(config)
+    check_config(config)
     with new_folder(Path(out)) as folder:
         load_open3d()  # if it is not there, that is said before a room is built
         job = _prepare(config, folder)
@@ -138,43 +74,18 @@ def render_sequence(
 class _Job:
     """Everything that stays the same from frame to frame.
 
-    ``poses`` and ``depth_poses`` are T_world_camera (N, 4, 4) when colour and depth are taken.
+    ``poses`` are T_world_camera (N, 4, 4) when colour is taken.
     """
 
     config: RenderConfig
     folder: Path
     camera: Camera
+    path: CameraPath
     poses: Array
-    depth_poses: Array
     stamps: list[str]
     scene: Scene
     cast: Cast
     renderer: Renderer
-
-
-def _check(config: RenderConfig) -> None:
-    if config.name not in SCENES:
-        known = f"{', '.join(SCENES)}{did_you_mean(config.name, SCENES)}"
-        raise InputError(f"scene {config.name!r} is unknown; choose one of {known}")
-    for name, number in (("frames", config.frames), ("rounds", config.rounds)):
-        if number is not None and number < 1:
-            raise InputError(f"{name}={number}: must be at least 1")
-    if config.rounds > 1 and config.name not in CLOSED:
-        raise InputError(
-            f"rounds={config.rounds}: the path of {config.name!r} does not end where it began; "
-            f"only {', '.join(CLOSED)} can be walked more than once"
-        )
-    if min(config.people, config.seed) < 0:
-        raise InputError(f"people={config.people}, seed={config.seed}: must not be negative")
-    if config.carry and not config.people:
-        raise InputError("carry: there is nobody to carry anything; ask for people=1")
-    if not 0.1 <= config.fps <= 1000:
-        raise InputError(f"fps={config.fps}: must be between 0.1 and 1000")
-    if not abs(config.depth_delay_ms) <= 1000:
-        raise InputError(f"depth delay {config.depth_delay_ms} ms: must be at most 1000 either way")
-    check_sensors(config.sensors)
-    if min(config.width, config.height) < 16:
-        raise InputError(f"{config.width}x{config.height}: too small; use at least 16x16")
 
 
 @dataclass(frozen=True)
@@ -209,8 +120,6 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
             f"people={config.people}: {config.name!r} has room for {len(plan.roles)}; ask for fewer"
         )
     poses = poses[: config.frames]
-    delay_s = config.depth_delay_ms / 1e3
-    late = camera_poses(plan.path, config.fps, config.seed, delay_s, config.sweeping)
     detail = float(np.clip(config.width / 640, 0.25, 1.0))
     alike = RenderConfig(config.name, None, config.seed, config.people, config.carry)
     hung = (MARKERS,) if MARKERS in config.sensors else ()
@@ -222,7 +131,7 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
     camera = kinect_camera(config)
     stamps = [f"{i / config.fps:.6f}" for i in range(len(poses))]
     shown = Renderer(camera, scene.atlas, scene.static)
-    return _Job(config, folder, camera, poses, late[: config.frames], stamps, scene, cast, shown)
+    return _Job(config, folder, camera, plan.path, poses, stamps, scene, cast, shown)
 
 
 @lru_cache(maxsize=4)
@@ -261,13 +170,14 @@ def _draw_all(job: _Job) -> Generator[list[VisibleInstance], None, None]:
 def _draw(job: _Job, i: int) -> list[VisibleInstance]:
     """Draw, disturb and write frame ``i``: a function of the configuration and ``i`` alone."""
     time_s = i / job.config.fps
-    view = job.renderer.render(job.poses[i], _moving(job, time_s))
+    view = job.renderer.render(_poses(job, time_s), _moving(job, time_s))
     rng = np.random.default_rng([job.config.seed, 3, i])
     rgb = _exposed(job, i, view, rng)
     true_m, normals = view.depth_m, view.normals
     if job.config.depth_delay_ms:
         delayed_s = time_s + job.config.depth_delay_ms / 1e3
-        true_m, normals = job.renderer.render_depth(job.depth_poses[i], _moving(job, delayed_s))
+        late = _poses(job, delayed_s)
+        true_m, normals = job.renderer.render_depth(late, _moving(job, delayed_s))
     depth_m = measure_depth(true_m, normals, job.camera, rng) if job.config.noise else true_m
     name = f"{job.stamps[i]}.png"
     write_png(job.folder / "rgb" / name, rgb)
@@ -278,6 +188,16 @@ def _draw(job: _Job, i: int) -> list[VisibleInstance]:
     if job.config.normals:
         write_png(job.folder / "normals" / name, to_image(127.5 * view.normals + 127.5))
     return visible_instances(view.instances)
+
+
+def _poses(job: _Job, time_s: float) -> Array:
+    """T_world_camera (4, 4) of an image at a time; of each row (H, 4, 4) where they take turns."""
+    config = job.config
+    if not config.rolling_shutter_ms:
+        return poses_at(job.path, np.array([time_s]), config.seed, config.sweeping)[0]
+    camera = replace(job.camera, rolling_shutter_s=config.rolling_shutter_ms / 1e3)
+    rows_s = time_s + exposed_after_s(np.arange(camera.height, dtype=float), camera)
+    return poses_at(job.path, rows_s, config.seed, config.sweeping)
 
 
 def _moving(job: _Job, time_s: float) -> Geometry | None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S
-from bmask_slam.rendering.sequence import RenderConfig
+from bmask_slam.rendering.config import RenderConfig
 
 VERDICT_METRICS = ("ate_rmse", "rpe_trans_rmse_second", "rpe_rot_rmse_second")
 """Not times: cells that run side by side disturb each other's."""

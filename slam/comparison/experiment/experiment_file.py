@@ -21,7 +21,7 @@ from bmask_slam.graph.data_files import given_or_shipped
 from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.files.yaml_file import read_yaml
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S
-from bmask_slam.rendering.sequence import SCENES, RenderConfig
+from bmask_slam.rendering.config import SCENES, RenderConfig
 from bmask_slam.reporting.metric_table import BY_NAME
 from bmask_slam.system_config import SystemConfig
 

@@ -22,7 +22,7 @@ from bmask_slam.config.configuration import differences, dump, find_config, reso
 from bmask_slam.evaluation.reference import TRUTH, TRUTH_BODY
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.files.reading import read_bytes, read_text
-from bmask_slam.rendering.sequence import RenderConfig
+from bmask_slam.rendering.config import RenderConfig
 from bmask_slam.runtime.machine import commit, describe_machine, versions
 from bmask_slam.system_config import SystemConfig
 

@@ -17,7 +17,7 @@ from bmask_slam.comparison.experiment.provenance import (
 )
 from bmask_slam.comparison.jobs.job import Job
 from bmask_slam.graph.files.file_names import plain_path
-from bmask_slam.rendering.sequence import RenderConfig
+from bmask_slam.rendering.config import RenderConfig
 
 SEQUENCES, CELLS = "sequences", "cells"
 SEED_SETTING = "loops.verification.seed={}"

@@ -49,18 +49,21 @@ def look_at(eyes: Array, targets: Array) -> Array:
     return make_pose(np.stack([right, np.cross(forward, right), forward], axis=-1), eyes)
 
 
-def camera_poses(
-    path: CameraPath, fps: float, seed: int, delay_s: float = 0.0, sweeping: bool = False
-) -> Array:
-    """All poses T_world_camera (F, 4, 4) along the path, with the tremor of a hand.
+def camera_poses(path: CameraPath, fps: float, seed: int, sweeping: bool = False) -> Array:
+    """The poses T_world_camera (F, 4, 4) of all frames along the path."""
+    stamps = np.arange(int(_share_times_s(path)[-1] * fps) + 1) / fps
+    return poses_at(path, stamps, seed, sweeping)
 
-    ``delay_s`` samples the same motion that much later than each frame; ``sweeping`` adds SWEEP.
+
+def poses_at(path: CameraPath, times_s: Array, seed: int, sweeping: bool = False) -> Array:
+    """Poses T_world_camera (N, 4, 4) along the path at times (N,), with the tremor of a hand.
+
+    ``sweeping`` adds SWEEP.
     """
-    stamps = np.arange(int(_share_times_s(path)[-1] * fps) + 1) / fps + delay_s
-    poses = steady_poses(path, stamps)
+    poses = steady_poses(path, times_s)
     if sweeping:
-        poses = poses @ _sweep(stamps)
-    return _shaken(poses, stamps, np.random.default_rng([seed, 7]))
+        poses = poses @ _sweep(times_s)
+    return _shaken(poses, times_s, np.random.default_rng([seed, 7]))
 
 
 def steady_poses(path: CameraPath, times_s: Array) -> Array:

@@ -84,7 +84,10 @@ def _affine(corners: Array, values: Array) -> Array:
 
 
 class Renderer:
-    """Draws a static scene, and moving things in it, from given poses."""
+    """Draws a static scene, and moving things in it, from given poses.
+
+    Poses are T_world_camera (4, 4), or of each row (H, 4, 4) of a rolling shutter.
+    """
 
     def __init__(self, camera: Camera, atlas: Atlas, static: Geometry) -> None:
         self._camera, self._atlas, self._static = camera, atlas, static
@@ -96,7 +99,7 @@ class Renderer:
         h, w = self._camera.height, self._camera.width
         layers, tables = _stack(self._static, moving)
         hits = self._cast(layers, self._pixels, T_world_camera)
-        colour = self._shade(tables, hits, T_world_camera)
+        colour = self._shade(tables, hits, self._pixels, T_world_camera)
         surface = tables[1][hits[1]].reshape(h, w)
         edges = _edges(surface, hits[0].reshape(h, w), colour.reshape(h, w, 3)).ravel()
         colour[edges] = self._supersample(layers, tables, self._pixels[edges], T_world_camera)
@@ -122,8 +125,8 @@ class Renderer:
         t, triangle, rays = hits
         depth = np.where(triangle >= 0, t, np.nan).astype(np.float32)
         normals, _ = _facing(tables[0][:, 12:15].take(triangle, axis=0, mode="clip"), rays)
-        normals = normals @ T_world_camera[:3, :3].astype(np.float32)
-        return depth.reshape(h, w), normals.reshape(h, w, 3)
+        normals = normals.reshape(h, w, 3) @ T_world_camera[..., :3, :3].astype(np.float32)
+        return depth.reshape(h, w), normals
 
     def _supersample(
         self, layers: list[Geometry], tables: _Tables, pixels: Floats, T_world_camera: Array
@@ -133,16 +136,16 @@ class Renderer:
         offsets = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]], np.float32) / np.float32(4)
         many = (pixels[None] + offsets[:, None]).reshape(-1, 2)
         hits = self._cast(layers, many, T_world_camera)
-        colour = self._shade(tables, hits, T_world_camera)
+        colour = self._shade(tables, hits, many, T_world_camera)
         return colour.reshape(4, -1, 3).mean(0)
 
     def _cast(self, layers: list[Geometry], pixels: Floats, T_world_camera: Array) -> _Hits:
         """Nearest hits of rays whose direction has z = 1 in the camera, so that t is z-depth."""
-        camera, R = self._camera, T_world_camera[:3, :3].astype(np.float32)
+        camera, (R, origin) = self._camera, _rows_of(T_world_camera, pixels)
         x = (pixels[:, 0] - np.float32(camera.cx)) / np.float32(camera.fx)
         y = (pixels[:, 1] - np.float32(camera.cy)) / np.float32(camera.fy)
         rays = np.empty((len(pixels), 6), np.float32)
-        rays[:, :3] = T_world_camera[:3, 3]
+        rays[:, :3] = origin.T
         for k in range(3):
             rays[:, 3 + k] = R[k, 0] * x + R[k, 1] * y + R[k, 2]
         o3d = load_open3d()
@@ -158,7 +161,7 @@ class Renderer:
             first += len(layer.rows)
         return t, triangle, rays[:, 3:]
 
-    def _shade(self, tables: _Tables, hits: _Hits, T_world_camera: Array) -> Floats:
+    def _shade(self, tables: _Tables, hits: _Hits, pixels: Floats, T_world_camera: Array) -> Floats:
         """Colours (N, 3), black where nothing is hit.
 
         The footprint of a pixel in the texture is exact: with p = o + t d on the plane of normal
@@ -171,16 +174,16 @@ class Renderer:
         texture = tables[1].take(triangle, mode="clip")
         t = np.where(triangle >= 0, t, 1).astype(np.float32)
         A, n, d = rows[:12].reshape(3, 4, -1), rows[12:15], np.ascontiguousarray(d.T)
-        points = T_world_camera[:3, 3, None].astype(np.float32) + t * d
+        R, origin = _rows_of(T_world_camera, pixels)
+        points = origin + t * d
         value = [_product(a[:3], points) + a[3] for a in A]
         slope = _product(n, d)
         n = n * -np.sign(slope)
         slope = np.where(np.abs(slope) < 1e-3, np.float32(1e-3), -np.abs(slope))
-        R = T_world_camera[:3, :3].astype(np.float32)
         steps = []
         for axis, focal in ((0, self._camera.fx), (1, self._camera.fy)):
             D = R[:, axis] / np.float32(focal)
-            move = t * (D[:, None] - d * ((D @ n) / slope))
+            move = t * (D - d * (_product(D, n) / slope))
             steps.append([_product(a[:3], move) for a in A[:2]])
         sizes = self._atlas.sizes.T.take(texture, axis=1)
         texels = np.maximum(*(_longer(step, sizes) for step in steps))
@@ -199,6 +202,15 @@ class Renderer:
 
 _Tables = tuple[Floats, NDArray[np.int32], NDArray[np.int32]]
 _Hits = tuple[Floats, Ints, Floats]
+
+
+def _rows_of(T_world_camera: Array, pixels: Floats) -> tuple[Floats, Floats]:
+    """Rotations (3, 3, N) and positions (3, N) when pixels (N, 2) are seen; N is 1 if at once."""
+    T = T_world_camera.astype(np.float32)
+    if T.ndim == 2:
+        return T[:3, :3, None], T[:3, 3, None]
+    T = T.transpose(1, 2, 0).take(np.rint(pixels[:, 1]).astype(int), axis=2)
+    return T[:3, :3], T[:3, 3]
 
 
 def _product(a: NDArray[Any], b: NDArray[Any]) -> Floats:

@@ -22,7 +22,7 @@ from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import write_tum
 from bmask_slam.offline.runner import RunSummary
-from bmask_slam.rendering.sequence import SCENES, RenderConfig
+from bmask_slam.rendering.config import SCENES, RenderConfig
 from bmask_slam.runtime.progress import console_log
 from bmask_slam.system_config import SystemConfig
 

@@ -29,7 +29,7 @@ from bmask_slam.comparison.jobs.plan import make_plan
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.graph.trajectory import Trajectory, write_tum
-from bmask_slam.rendering.sequence import RenderConfig
+from bmask_slam.rendering.config import RenderConfig
 
 XYZ = SequenceSource("xyz", "tum/freiburg1_xyz")
 OFFICE = SequenceSource("office", render=RenderConfig("office", 5))

@@ -36,7 +36,7 @@ from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.occupancy import OCCUPIED
 from bmask_slam.mapping.products.submaps import read_submap, write_submap
-from bmask_slam.rendering.sequence import RenderConfig
+from bmask_slam.rendering.config import RenderConfig
 from bmask_slam.run_folder.map_file import read_map, write_map
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.semantics.beliefs.label_store import LabelStore

@@ -23,10 +23,11 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.yaml_file import format_yaml, read_yaml
 from bmask_slam.graph.geometry import make_pose
+from bmask_slam.rendering.config import RenderConfig
 from bmask_slam.rendering.engine.path import camera_poses
 from bmask_slam.rendering.engine.raycast import Renderer, to_image
 from bmask_slam.rendering.rooms import office
-from bmask_slam.rendering.sequence import RenderConfig, _built
+from bmask_slam.rendering.sequence import _built
 from bmask_slam.rendering.writer import stored_depth, write_lists, write_png
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.labels import label_set

@@ -11,7 +11,8 @@ import numpy as np
 from bmask_slam.graph.geometry import transform
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.rendering.annotations import OBJECTS_TRUTH
-from bmask_slam.rendering.sequence import RenderConfig, kinect_camera, render_sequence
+from bmask_slam.rendering.config import RenderConfig, kinect_camera
+from bmask_slam.rendering.sequence import render_sequence
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
 from bmask_slam.semantics.objects.object_map import pixel_rays
 

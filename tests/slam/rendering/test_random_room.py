@@ -12,6 +12,7 @@ import pytest
 
 from bmask_slam.graph.arrays import Image
 from bmask_slam.rendering.annotations import CLASSES
+from bmask_slam.rendering.config import RenderConfig
 from bmask_slam.rendering.engine.builder import Painter, SceneBuilder
 from bmask_slam.rendering.engine.meshes import pose
 from bmask_slam.rendering.engine.path import camera_poses
@@ -19,7 +20,7 @@ from bmask_slam.rendering.rooms.random_furniture import add_piece
 from bmask_slam.rendering.rooms.random_layout import distance_m, moved_rect, overlap, wall_poses
 from bmask_slam.rendering.rooms.random_room import RandomRoom, draw_room
 from bmask_slam.rendering.rooms.room import Room
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.rendering.sequence import render_sequence
 from bmask_slam.rendering.things.people import Person, add_people
 
 

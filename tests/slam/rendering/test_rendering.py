@@ -6,6 +6,7 @@ import filecmp
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,13 +21,14 @@ from bmask_slam.graph.files.yaml_file import read_yaml
 from bmask_slam.graph.geometry import inverse, rotation_from_quaternion, so3_exp, so3_log, transform
 from bmask_slam.rendering import sequence as renderer
 from bmask_slam.rendering.annotations import CATEGORY_IDS
+from bmask_slam.rendering.config import SCENES, RenderConfig, kinect_camera
 from bmask_slam.rendering.engine.atlas import build_atlas
 from bmask_slam.rendering.engine.meshes import quad
 from bmask_slam.rendering.engine.path import CameraPath, camera_poses, look_at
 from bmask_slam.rendering.engine.raycast import Renderer, build_geometry
 from bmask_slam.rendering.engine.sensor import blur, depth_sigma_m, measure_depth, optical_flow
 from bmask_slam.rendering.rooms import corridor, living_room, office
-from bmask_slam.rendering.sequence import SCENES, RenderConfig, kinect_camera, render_sequence
+from bmask_slam.rendering.sequence import render_sequence
 from bmask_slam.rendering.things.people import PULLED_S, Person, Role
 
 PERSON = CATEGORY_IDS["person"]
@@ -375,3 +377,21 @@ def test_scenes_are_listed_without_open3d() -> None:
     code = "import sys, bmask_slam.rendering.sequence; assert 'open3d' not in sys.modules"
     root = ROOT
     subprocess.run([sys.executable, "-c", code], cwd=root, check=True)
+
+
+@pytest.mark.parametrize("ms", [-20.0, 20.0])
+def test_each_row_of_a_rolling_shutter_is_seen_from_its_own_pose(tmp_path: Path, ms: float) -> None:
+    """A row of 120 is exposed ms (row - 59.5) / 120 after the middle, in colour and depth."""
+    config = RenderConfig("office", 31, width=160, height=120, noise=False, sweeping=True)
+    rolled = render_sequence(replace(config, rolling_shutter_ms=ms), tmp_path / "rolled")
+    for row in (60, 5, 114):
+        later_ms = ms * ((row + 0.5) / 120 - 0.5)
+        then = render_sequence(replace(config, depth_delay_ms=later_ms), tmp_path / f"{row}")
+        shown, own, middle = (
+            cv2.imread(str(tmp_path / name / "depth/1.000000.png"), cv2.IMREAD_UNCHANGED)
+            for name in ("rolled", f"{row}", "60")
+        )
+        assert np.abs(shown[row].astype(int) - own[row]).max() <= 1
+        assert row == 60 or np.abs(shown[row].astype(int) - middle[row]).max() > 10
+    colours = [cv2.imread(str(folder / "rgb/1.000000.png"))[60] for folder in (rolled, then)]
+    assert np.abs(colours[0].astype(int) - colours[1]).mean() < 1

@@ -14,8 +14,9 @@ from bmask_slam.graph.sensors.mounting import T_of
 from bmask_slam.graph.sensors.odometry import motion_between
 from bmask_slam.graph.sensors.streams import COLUMNS, SensorStreams, read_folder
 from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.rendering.config import RenderConfig
 from bmask_slam.rendering.sensors import GRAVITY_M_S2, POSITION_SIGMA_M, T_ENU_RENDERED
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.rendering.sequence import render_sequence
 
 CONFIG = RenderConfig("corridor", 31, fps=10.0, width=32, height=24, sensors=tuple(COLUMNS))
 

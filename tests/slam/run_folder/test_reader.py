@@ -18,7 +18,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.offline import runner
 from bmask_slam.offline.options import RunOptions
-from bmask_slam.rendering.sequence import RenderConfig
+from bmask_slam.rendering.config import RenderConfig
 from bmask_slam.run_folder.covariance_file import COVARIANCES, read_covariances
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.run_folder.semantic_files import read_labels

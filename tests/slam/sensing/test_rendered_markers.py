@@ -12,8 +12,8 @@ import bmask_slam
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, make_pose, rotation_from_quaternion, se3_log
+from bmask_slam.rendering.config import RenderConfig
 from bmask_slam.rendering.markers import MARKER_SIZE_M, TRUTH
-from bmask_slam.rendering.sequence import RenderConfig
 from bmask_slam.sequences.sequence import open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
