@@ -5,8 +5,8 @@ update. At the end of a run the other frames' observations are known too, four t
 all poses and landmarks are variables: Gauss-Newton steps, damped as Levenberg and Marquardt do, in
 which the landmarks are eliminated and the poses found by conjugate gradients on the Schur
 complement, which is never formed (Agarwal et al., Bundle Adjustment in the Large, ECCV 2010).
-All other factors (priors, loops, sensors, users' own) are linearised by GTSAM; their variables
-that are neither poses nor landmarks keep their values.
+All other factors (priors, loops, sensors, users' own) are linearised by GTSAM, together with the
+states of inertial ones (velocities, biases, directions of gravity).
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
-from scipy.sparse import bsr_array, csr_array
-from scipy.sparse.linalg import LinearOperator, cg
+from scipy.sparse import block_diag, bsr_array, csc_array, csr_array, diags_array
+from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.batch.group_sums import GroupSums
@@ -90,6 +91,7 @@ def adjust_jointly(
     count = len(tables.keyframes.ids)
     tables.keyframes.values = problem.poses[:count].copy()
     tables.landmarks.values = problem.points
+    problem.factors.keep_states()
     return JointResult(problem.poses[count:], before, problem.cost, problem.steps, outliers)
 
 
@@ -109,9 +111,9 @@ class _Problem:
         self._point = np.searchsorted(tables.landmarks.ids, self._observations.landmark_ids)
         self.poses = np.concatenate([tables.keyframes.values, frames.poses_world_camera])
         self.points = tables.landmarks.values.copy()
-        self._factors = OtherFactors(tables, camera, config)
+        self.factors = OtherFactors(tables, camera, config)
         self._damping, self.steps = FIRST_DAMPING, 0
-        self.cost = self._cost(self.poses, self.points)
+        self.cost = self._cost(self.poses, self.points, self.factors.states)
 
     def drop_outliers(self) -> int:
         """Leave out observations of frames beyond their bound; returns their number."""
@@ -122,7 +124,7 @@ class _Problem:
         kept |= self._pose < self._count
         self._observations = self._observations.select(kept)
         self._pose, self._point = self._pose[kept], self._point[kept]
-        self.cost = self._cost(self.poses, self.points)
+        self.cost = self._cost(self.poses, self.points, self.factors.states)
         return int(np.count_nonzero(~kept))
 
     @property
@@ -150,17 +152,18 @@ class _Problem:
 
     def _step(self, system: _System) -> bool:
         """Take a step if the cost falls; whether it does."""
-        xi, shift = system.solve(self._damping)
+        xi, shift, change = system.solve(self._damping)
         poses, points = self.poses @ se3_exp(xi), self.points + shift
-        cost = self._cost(poses, points)
+        states = self.factors.moved(change)
+        cost = self._cost(poses, points, states)
         if not cost < self.cost:
             return False
-        self.poses, self.points, self.cost = poses, points, cost
+        self.poses, self.points, self.factors.states, self.cost = poses, points, states, cost
         return True
 
-    def _cost(self, poses: Array, points: Array) -> float:
+    def _cost(self, poses: Array, points: Array, states: gtsam.Values) -> float:
         """Half the sum of squared errors with Huber's kernel; infinite beyond all values."""
-        total, config = self._factors.cost(poses[: self._count], points), self._config
+        total, config = self.factors.cost(poses[: self._count], points, states), self._config
         for rows in _chunks(len(self._pose)):
             squares = self._chi2(rows, poses, points)
             k = np.where(self._stereo[rows], config.huber_stereo, config.huber_mono)
@@ -189,9 +192,9 @@ class _Problem:
             H_point += of_points(J_point_T @ J_point)
             g_pose += of_poses((J_pose_T @ r[:, :, None])[:, :, 0])
             g_point += of_points((J_point_T @ r[:, :, None])[:, :, 0])
-        A, b = self._factors.linearised(self.poses[: self._count], self.points, 6 * P)
-        g_pose -= (A.T @ b).reshape(P, 6)
-        return _System(H_pose, g_pose, H_point, g_point, A, cross, self._pose, self._point)
+        A, b = self.factors.linearised(self.poses[: self._count], self.points, 6 * P)
+        g = np.concatenate([g_pose.ravel(), np.zeros(self.factors.width)]) - A.T @ b
+        return _System(H_pose, H_point, g, g_point, A, cross, self._pose, self._point)
 
 
 def _chunks(count: int) -> list[Ints]:
@@ -201,23 +204,23 @@ def _chunks(count: int) -> list[Ints]:
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """Normal equations of poses and points at one place.
+    """Normal equations of poses, S states and points at one place.
 
     Blocks H_pose (P, 6, 6), H_point (L, 3, 3) and cross (M, 6, 3), by pose and then point, with
-    gradients (P, 6), (L, 3); ``A`` (R, 6P) are the other factors.
+    gradients g (6P + S,) and g_point (L, 3); ``A`` (R, 6P + S) are the other factors.
     """
 
     H_pose: Array
-    g_pose: Array
     H_point: Array
+    g: Array
     g_point: Array
     A: csr_array
     cross: Array
     pose: Ints
     point: Ints
 
-    def solve(self, damping: float) -> tuple[Array, Array]:
-        """Tangents (P, 6) of the poses, on the right side, and shifts (L, 3) of the points."""
+    def solve(self, damping: float) -> tuple[Array, Array, Array]:
+        """Tangents (P, 6) of the poses, on the right side, shifts (L, 3) of points, states (S,)."""
         P, L = len(self.H_pose), len(self.H_point)
         starts = np.searchsorted(self.pose, np.arange(P + 1))
         C = bsr_array((self.cross, self.point, starts), shape=(6 * P, 3 * L))
@@ -225,29 +228,34 @@ class _System:
         damped = self.H_point * (1 + damping * np.eye(3)) + POINT_FLOOR_PER_M2 * np.eye(3)
         inverse_point = np.asarray(np.linalg.inv(damped), float)
         H_pose = self.H_pose * (1 + damping * np.eye(6))
+        squares = self.A.multiply(self.A).sum(axis=0)[6 * P :]
+        H = csc_array(self.A.T @ self.A + diags_array(np.r_[np.zeros(6 * P), damping * squares]))
 
         def times(x: Array) -> Array:
-            """The Schur complement times x (6P,)."""
-            inner = (inverse_point @ (C_T @ x).reshape(L, 3, 1)).ravel()
-            outer = (H_pose @ x.reshape(P, 6, 1)).ravel()
-            return np.asarray(outer + self.A.T @ (self.A @ x) - C @ inner)
+            """The Schur complement times x (6P + S,)."""
+            poses = x[: 6 * P]
+            inner = (inverse_point @ (C_T @ poses).reshape(L, 3, 1)).ravel()
+            y = np.asarray(H @ x)
+            y[: 6 * P] += (H_pose @ poses.reshape(P, 6, 1)).ravel() - C @ inner
+            return y
 
         right = (inverse_point @ self.g_point[:, :, None]).ravel()
-        b = np.asarray(C @ right) - self.g_pose.ravel()
-        blocks = self._preconditioner(H_pose, inverse_point)
-        operator = LinearOperator((6 * P, 6 * P), times)
-        easier = LinearOperator((6 * P, 6 * P), lambda x: (blocks @ x.reshape(P, 6, 1)).ravel())
-        x, _ = cg(operator, b, rtol=CG_TOLERANCE, maxiter=CG_STEPS, M=easier)
-        shift = -right - (inverse_point @ (C_T @ x).reshape(L, 3, 1)).ravel()
-        return x.reshape(P, 6), shift.reshape(L, 3)
+        b = -self.g
+        b[: 6 * P] += C @ right
+        size = len(b), len(b)
+        easier = LinearOperator(size, self._preconditioner(H_pose, inverse_point, H).solve)
+        x, _ = cg(LinearOperator(size, times), b, rtol=CG_TOLERANCE, maxiter=CG_STEPS, M=easier)
+        poses, states = x[: 6 * P], x[6 * P :]
+        shift = -right - (inverse_point @ (C_T @ poses).reshape(L, 3, 1)).ravel()
+        return poses.reshape(P, 6), shift.reshape(L, 3), states
 
-    def _preconditioner(self, H_pose: Array, inverse_point: Array) -> Array:
-        """Inverses (P, 6, 6) of the diagonal blocks of the Schur complement."""
+    def _preconditioner(self, H_pose: Array, inverse_point: Array, H: csc_array) -> SuperLU:
+        """The Schur complement without what points join of different poses, factorised."""
         blocks = H_pose.copy()
         for rows in _chunks(len(self.pose)):
             cross = self.cross[rows]
             known = cross @ inverse_point[self.point[rows]] @ cross.swapaxes(1, 2)
             blocks -= GroupSums(self.pose[rows], len(blocks))(known)
-        squares = np.asarray(self.A.multiply(self.A).sum(axis=0)).reshape(-1, 6)
-        blocks[:, range(6), range(6)] += squares
-        return np.asarray(np.linalg.inv(blocks), float)
+        P, S = len(blocks), H.shape[0] - 6 * len(blocks)
+        alone = block_diag([bsr_array((blocks, np.arange(P), np.arange(P + 1))), csr_array((S, S))])
+        return splu(csc_array(alone + H), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
@@ -69,7 +71,7 @@ def make_room(
     if disparity_noise_px is not None:
         sigmas_px[2] = disparity_noise_px
     rng = np.random.default_rng(seed)
-    poses = _circle(keyframes)
+    poses = circle(np.arange(keyframes))
     points_world = rng.uniform([-2.0, -1.2, -2.0], [2.0, 1.2, 2.0], (points, 3))
     keyframe_ids, landmark_ids, measurements = _measure(poses, points_world)
     measurements = noisy(measurements, rng.normal(0, 1, measurements.shape) * sigmas_px)
@@ -101,9 +103,12 @@ def noisy(measurements: Array, noise_px: Array) -> Array:
     return np.stack([u_noisy, v + noise_px[:, 1], u_noisy - disparity], axis=1)
 
 
-def _circle(count: int) -> Array:
-    """Cameras 3.5 m from the middle, 11 degrees apart, y down, looking at the middle."""
-    angle = np.radians(11.0) * np.arange(count)
+def circle(keyframes: NDArray[Any]) -> Array:
+    """Poses (N, 4, 4) of the keyframes (N,) on a circle, or between them; y down.
+
+    They are 3.5 m from the middle, 11 degrees apart, and look at it.
+    """
+    angle = np.radians(11.0) * keyframes
     centre = 3.5 * np.stack([np.sin(angle), 0.1 * np.cos(3 * angle), -np.cos(angle)], axis=1)
     z = -centre / np.linalg.norm(centre, axis=1, keepdims=True)
     x = np.cross([0.0, 1.0, 0.0], z)

@@ -1,11 +1,12 @@
 """Adjustment with frames that are no keyframes: the optimum that GTSAM finds of all together."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 import pytest
-from synthetic_room import CAMERA, Room, make_room
+from synthetic_room import CAMERA, Room, circle, make_room
 
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.batch import joint_adjustment
@@ -16,8 +17,12 @@ from bmask_slam.graph.factors.keys import keyframe_keys
 from bmask_slam.graph.factors.own_factors import own_factor
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
+from bmask_slam.graph.inertial.tables import InertialFactor, InertialUpdate
+from bmask_slam.graph.sensors.imu import ImuConfig, readings_between
+from bmask_slam.graph.sensors.streams import Measurements, SensorStreams
 from bmask_slam.graph.smoother.isam2 import SolverError
 from bmask_slam.graph.smoother.smoother import Smoother
+from bmask_slam.rendering.sensors import imu
 
 KEYFRAMES, FRAMES = np.arange(0, 12, 3), np.setdiff1d(np.arange(12), np.arange(0, 12, 3))
 EXACT = SmootherConfig(least_decrease=1e-12)
@@ -97,6 +102,44 @@ def test_the_optimum_is_that_of_one_graph(with_loop: bool) -> None:
     assert found.outliers == 0
     if with_loop:  # it is not left out, nor does it go unnoticed
         assert apart(keyframes, by_gtsam(room, ())[0]) > 1e-3
+
+
+def inertial(room: Room) -> InertialUpdate:
+    """An IMU's factors between the keyframes, at states that are not known well."""
+    hertz, interval_s = 200.0, 0.5
+    config = ImuConfig(imu_in_camera=(0.2, -0.1, 0.05, 0.5, -0.5, 0.5, -0.5))
+    steps = np.arange(len(room.poses_world_camera) * int(hertz * interval_s))
+    path = circle(steps / (hertz * interval_s))
+    streams = SensorStreams()
+    streams.add(Measurements("imu", imu(path, hertz, config, np.random.default_rng(3))))
+    factors = []
+    for a, b in pairwise(KEYFRAMES.tolist()):
+        readings = readings_between(streams, a * interval_s, b * interval_s, config)
+        assert readings is not None
+        factors.append(InertialFactor(a, b, 0, readings, config.model))
+    states = {k: np.zeros(9) for k in KEYFRAMES.tolist()}
+    return InertialUpdate(tuple(factors), states=states, down={0: np.array([0.6, 0.0, -0.8])})
+
+
+@pytest.mark.usefixtures("converged")
+def test_velocities_biases_and_gravity_are_found_with_it() -> None:
+    room = make_room(noise_px=0.5)
+    tables, together = tables_of(room, KEYFRAMES), tables_of(room, np.arange(12))
+    for each in (tables, together):
+        each.inertial.add(inertial(room))
+    frames, smoother = frames_of(room), Smoother(CAMERA, EXACT)
+    smoother._tables = together
+    for _ in range(2):  # readings are integrated at the biases that were found before
+        found = adjust_jointly(tables, frames, CAMERA, EXACT)
+        frames = replace(frames, poses_world_camera=found.poses_world_camera)
+        smoother.optimise_batch()
+    assert apart(tables.keyframes.values, together.keyframes.get(KEYFRAMES)) < 2e-6
+    for k in KEYFRAMES.tolist():
+        state = tables.inertial.states[k]
+        np.testing.assert_allclose(state, together.inertial.states[k], atol=1e-4)
+        assert np.abs(state[:3]).max() > 0.1
+    np.testing.assert_allclose(tables.inertial.down[0], together.inertial.down[0], atol=1e-5)
+    np.testing.assert_allclose(tables.inertial.down[0], [0, 0, -1], atol=0.01)
 
 
 @pytest.mark.usefixtures("all_stay")
