@@ -46,10 +46,12 @@ class Frames:
     Attributes:
         poses_world_camera: (F, 4, 4).
         observations: of landmarks of the graph; ``keyframe_ids`` are rows of the poses, ascending.
+        weight: of all factors that are no observations; 1 as in the graph.
     """
 
     poses_world_camera: Array
     observations: Observations
+    weight: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +113,7 @@ class _Problem:
         self._point = np.searchsorted(tables.landmarks.ids, self._observations.landmark_ids)
         self.poses = np.concatenate([tables.keyframes.values, frames.poses_world_camera])
         self.points = tables.landmarks.values.copy()
-        self.factors = OtherFactors(tables, camera, config)
+        self.factors, self._weight = OtherFactors(tables, camera, config), frames.weight
         self._damping, self.steps = FIRST_DAMPING, 0
         self.cost = self._cost(self.poses, self.points, self.factors.states)
 
@@ -163,7 +165,8 @@ class _Problem:
 
     def _cost(self, poses: Array, points: Array, states: gtsam.Values) -> float:
         """Half the sum of squared errors with Huber's kernel; infinite beyond all values."""
-        total, config = self.factors.cost(poses[: self._count], points, states), self._config
+        given, config = (poses[: self._count], points, states), self._config
+        total = self._weight * self.factors.cost(*given)
         for rows in _chunks(len(self._pose)):
             squares = self._chi2(rows, poses, points)
             k = np.where(self._stereo[rows], config.huber_stereo, config.huber_mono)
@@ -193,6 +196,7 @@ class _Problem:
             g_pose += of_poses((J_pose_T @ r[:, :, None])[:, :, 0])
             g_point += of_points((J_point_T @ r[:, :, None])[:, :, 0])
         A, b = self.factors.linearised(self.poses[: self._count], self.points, 6 * P)
+        A, b = A * math.sqrt(self._weight), b * math.sqrt(self._weight)
         g = np.concatenate([g_pose.ravel(), np.zeros(self.factors.width)]) - A.T @ b
         return _System(H_pose, H_point, g, g_point, A, cross, self._pose, self._point)
 

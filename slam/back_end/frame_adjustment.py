@@ -64,6 +64,7 @@ def frames_in(
     They begin at their poses in the paths. The errors of images in a row are alike: the same patch
     of a landmark and the same error of the depth sensor are in all of them. So all frames together
     count as much as the keyframes: their sigmas are larger by the root of how many more they are.
+    Loops and sensors get so much more weight that beside them the images count as in the graph.
     None if graph and frames have more observations than ``MAX_OBSERVATIONS``.
     """
     known, bf, depth_factor = tables.landmarks, camera.stereo_bf_px_m, camera.graph_depth_factor
@@ -85,8 +86,9 @@ def frames_in(
     if not parts or sum(map(len, parts)) + len(tables.observations) > MAX_OBSERVATIONS:
         return np.zeros(0), Frames(np.zeros((0, 4, 4)), Observations())
     given = concatenate(parts)
-    given.sigmas_px[:] *= np.sqrt(max(len(poses) / len(tables.keyframes.ids), 1.0))
-    return np.array(stamps_s), Frames(np.array(poses), given)
+    frames_each = len(poses) / len(tables.keyframes.ids)
+    given.sigmas_px[:] *= np.sqrt(max(frames_each, 1.0))
+    return np.array(stamps_s), Frames(np.array(poses), given, 1 + min(frames_each, 1.0))
 
 
 def _with_poses(

@@ -26,6 +26,7 @@ from bmask_slam.rendering.sensors import imu
 
 KEYFRAMES, FRAMES = np.arange(0, 12, 3), np.setdiff1d(np.arange(12), np.arange(0, 12, 3))
 EXACT = SmootherConfig(least_decrease=1e-12)
+NO_KERNEL = replace(EXACT, robust=False)
 LOOP = np.diag([1e-4] * 3 + [2e-4] * 3) ** 2
 
 
@@ -188,6 +189,23 @@ def test_without_frames_it_is_a_bundle_adjustment() -> None:
     found = adjust_jointly(tables, none, CAMERA, EXACT)
     assert len(found.poses_world_camera) == 0
     assert apart(tables.keyframes.values, smoother.tables.keyframes.values) < 1e-4
+
+
+@pytest.mark.usefixtures("converged")
+def test_a_weight_of_other_factors_is_like_larger_sigmas_of_observations() -> None:
+    room = make_room(noise_px=0.5)
+    loops = (wrong_loop(room),)
+    larger = replace(room.observations, sigmas_px=2 * room.observations.sigmas_px)
+    less = replace(room, observations=larger)
+    tables, other = tables_of(room, KEYFRAMES, loops), tables_of(less, KEYFRAMES, loops)
+    found = adjust_jointly(tables, replace(frames_of(room), weight=4.0), CAMERA, NO_KERNEL)
+    same = adjust_jointly(other, frames_of(less), CAMERA, NO_KERNEL)
+    assert apart(tables.keyframes.values, other.keyframes.values) < 1e-6
+    assert apart(found.poses_world_camera, same.poses_world_camera) < 1e-6
+    assert found.cost_after == pytest.approx(4 * same.cost_after, rel=1e-6)
+    alone = tables_of(room, KEYFRAMES, loops)
+    adjust_jointly(alone, frames_of(room), CAMERA, NO_KERNEL)
+    assert apart(alone.keyframes.values, tables.keyframes.values) > 1e-4
 
 
 @pytest.mark.usefixtures("converged")
