@@ -170,6 +170,11 @@ class LoopCloser:
                 if other in tried or here is (paths is None):
                     break
                 tried.add(other)
+                if paths and self.drift.out_of_reach(
+                    paths.way(other, keyframe.id), self.config.gate
+                ):
+                    self.recogniser.dismiss(other, keyframe.id)
+                    break
                 old = loop_view(world.keyframes[other], world)
                 result = verify_loop(old, view, self._camera, self.config.verification)
                 if isinstance(result, NoLoop):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -71,13 +72,29 @@ class MapDrift:
         ``alike_spacing_m`` cubed. The longer the way, the less tells even a loop that implies no
         drift.
         """
-        if not self.places_look_alike:
-            return False
         moved, S_moved = implied[None, 3:], S[3:, 3:]
-        minus_2_log = float(mahalanobis(moved, S_moved[None])[0])
-        minus_2_log += float(np.linalg.slogdet(2 * np.pi * S_moved)[1])
+        return self._alike_likelier(float(mahalanobis(moved, S_moved[None])[0]), S_moved)
+
+    def _alike_likelier(self, chi2: float, S_moved: Array) -> bool:
+        """Whether a look-alike is likelier than drift by this chi-square, of S_moved (3, 3)."""
+        minus_2_log = chi2 + float(np.linalg.slogdet(2 * np.pi * S_moved)[1])
         rules = self.config
-        return minus_2_log > 2 * np.log(rules.alike_spacing_m**3 / rules.alike_odds)
+        limit = 2 * math.log(rules.alike_spacing_m**3 / rules.alike_odds)
+        return self.places_look_alike and minus_2_log > limit
+
+    def out_of_reach(self, way: Array, gate: float) -> bool:
+        """Whether any loop between the ends of a way (N, 4, 4) is refused where places look alike.
+
+        Keyframes that show the same place are within ``reach_m``. Those that the map has further
+        apart imply so much drift at least: too much, or less likely than a look-alike.
+        """
+        if not (self.places_look_alike and len(way)):
+            return False
+        S_moved = self.covariance(way)[3:, 3:]
+        apart_m = float(np.linalg.norm(way[0, :3, 3] - way[-1, :3, 3]))
+        beyond_m = max(apart_m - self.config.reach_m, 0.0)
+        least_chi2 = beyond_m**2 / float(np.linalg.eigvalsh(S_moved)[-1])
+        return least_chi2 > gate or self._alike_likelier(least_chi2, S_moved)
 
     def learn(
         self, implied: Sequence[Array], covariances: Sequence[Array], ways: Sequence[Array]

@@ -32,7 +32,8 @@ class NoiseConfig:
     ``prior_closings`` and the factor ``drift_margin`` on the covariance; where places look alike,
     by a loop with ``alike_excess`` times the chi-square allowed, it is ``alike_share`` of that, and
     a loop must be ``alike_odds`` times likelier to be right than to be of one of the look-alikes,
-    which are ``alike_spacing_m`` apart.
+    which are ``alike_spacing_m`` apart. There keyframes are compared only if a loop between them
+    could be accepted: those that show one place are within ``reach_m`` of each other.
     """
 
     prior_ratio: float = 4.0
@@ -49,6 +50,7 @@ class NoiseConfig:
     alike_share: float = 0.2
     alike_spacing_m: float = 3.0
     alike_odds: float = 10.0
+    reach_m: float = 8.0
 
 
 @dataclass(frozen=True)

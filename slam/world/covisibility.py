@@ -57,9 +57,13 @@ class CovisiblePaths:
         world = self._world
         ids = np.fromiter(world.keyframes, np.int64)
         poses = np.array([k.T_world_camera for k in world.keyframes.values()])
-        observed = [world.observed(k)[1] for k in world.keyframes.values()]
-        rows = np.repeat(np.arange(len(ids)), [len(o) for o in observed])
-        columns = np.concatenate(observed)
+        rows = np.repeat(
+            np.arange(len(ids)), [len(k.landmark_ids) for k in world.keyframes.values()]
+        )
+        columns = np.concatenate([k.landmark_ids for k in world.keyframes.values()])
+        used = columns >= 0
+        used[used] = world.landmarks.in_map[columns[used]]
+        rows, columns = rows[used], columns[used]
         shape = len(ids), len(world.landmarks) + 1
         sees = csr_array((np.ones(len(rows), np.int32), (rows, columns)), shape)
         shared = (sees @ sees.T).tocoo()

@@ -10,8 +10,8 @@ from synthetic_view import CAMERA, T_NEW_OLD, add_keyframe, make_features
 
 from bmask_slam.events import EventLog
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.factors.checks import chi2_quantile
-from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
+from bmask_slam.graph.factors.checks import chi2_quantile, mahalanobis
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, se3_log
 from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
 from bmask_slam.loops.drift import MapDrift
 from bmask_slam.loops.noise import LoopNoise, NoiseConfig
@@ -273,3 +273,31 @@ def test_a_room_that_looks_like_another_is_no_loop() -> None:
         T_a_b = inverse(a) @ se3_exp([0, 0, 0, 0, 0, apart_m]) @ b
         found = replace(loop, keyframe_a=0, keyframe_b=26, T_a_b=T_a_b)
         assert closer._within_drift(found, world, paths) == fits
+
+
+@pytest.mark.parametrize(
+    ("length_m", "apart_m", "beyond"),
+    [(30, 8.0, False), (30, 9.0, True), (100, 8.0, False), (100, 12.0, True), (250, 0.0, True)],
+)
+def test_places_out_of_reach_are_those_whose_every_loop_would_be_refused(
+    length_m: int, apart_m: float, beyond: bool
+) -> None:
+    """There and back, to a place that is so far from where the walk began."""
+    drift, gate = MapDrift(NoiseConfig()), LoopClosingConfig().gate
+    there = straight(length_m // 2)
+    way = np.concatenate([there, there[-2::-1]])
+    way[:, 1, 3] += np.linspace(0, apart_m, len(way))
+    assert not drift.out_of_reach(way, gate)
+    drift.places_look_alike = True
+    assert drift.out_of_reach(way, gate) == beyond
+    assert not drift.out_of_reach(way[:0], gate)
+    if not beyond:
+        return
+    S = drift.covariance(way)
+    rng = np.random.default_rng(0)
+    T_a_b = inverse(way[0]) @ way[-1]
+    for direction in rng.normal(size=(200, 3)):
+        near = make_pose(np.eye(3), 7.9 * direction / np.linalg.norm(direction))
+        implied = se3_log(inverse(near) @ T_a_b)[None]
+        refused = float(mahalanobis(implied, S[None])[0]) > gate
+        assert refused or drift.alike_elsewhere(implied[0], S)
