@@ -1,4 +1,4 @@
-"""Hard inputs from recorded and rendered sequences: faster and blurred.
+"""Hard inputs from recorded and rendered sequences: faster, blurred, dark.
 
 They are written as folders in TUM layout.
 """
@@ -23,6 +23,7 @@ from bmask_slam.sequences.sequence import Sequence, open_sequence
 
 BURST, PAUSE = 12, 18
 """Numbers of consecutive frames that are blurred by a box, and that are not."""
+DARK_NOISE = 3.0
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class Hardship:
         max_frames: of those that are kept.
         shutter: blur along the image motion, as a share of the motion to the next kept frame.
         box_px: side of a box that blurs BURST frames in every BURST + PAUSE.
+        light: share of the light that there was, with noise of DARK_NOISE grey levels.
         fps: frame rate [Hz] that the kept frames get, so that the camera moves faster.
     """
 
@@ -41,6 +43,7 @@ class Hardship:
     max_frames: int | None = None
     shutter: float = 0.0
     box_px: int = 0
+    light: float = 1.0
     fps: float | None = None
 
 
@@ -74,7 +77,7 @@ def make_hard(source: Path, hardship: Hardship, out: Path) -> Path:
 
 
 def _disturbed(sequence: Sequence, kept: list[int], hardship: Hardship) -> Iterator[Frame]:
-    """The kept frames with blur."""
+    """The kept frames with blur, and in less light."""
     for k, index in enumerate(kept):
         frame = sequence.load(index)
         if hardship.box_px and k % (BURST + PAUSE) >= PAUSE:
@@ -85,6 +88,10 @@ def _disturbed(sequence: Sequence, kept: list[int], hardship: Hardship) -> Itera
             flow = _flow(sequence, frame, other) * np.float32(1 if other > index else -1)
             blurred = blur(frame.rgb.astype(np.float32), hardship.shutter * flow)
             frame = replace(frame, rgb=np.rint(blurred).astype(np.uint8))
+        if hardship.light < 1:
+            noise = np.random.default_rng(k).normal(0, DARK_NOISE, frame.rgb.shape)
+            dark = np.clip(np.rint(hardship.light * frame.rgb + noise), 0, 255)
+            frame = replace(frame, rgb=dark.astype(np.uint8))
         yield frame
 
 

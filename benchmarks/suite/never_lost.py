@@ -1,4 +1,4 @@
-"""Tracking of hard recordings (fast, blurred, in a crowd): shares of frames and errors.
+"""Tracking of hard recordings (fast, blurred, dark, in a crowd): shares of frames and errors.
 
     python -m benchmarks.suite.never_lost [NAME ...] [--repeats N] [--set A.B=C]
 
@@ -84,6 +84,9 @@ INPUTS = {
         name: Input(name, Hardship(shutter=0.5, fps=30.0), timing={"rolling_shutter_s": READOUT_S})
         for name in FAST
     },
+    "rpy-dark": Input("tum_fr1_rpy", Hardship(light=0.2), timing=KINECT_V1),
+    "bonn-dark": Input("bonn_crowd", Hardship(light=0.2), timing=XTION),
+    "kitchen-dark": Input("redkitchen", Hardship(max_frames=300, light=0.2), hand_eye=True),
     "kitchen": Input("redkitchen", hand_eye=True),
     "office": Input("office"),
 }
@@ -118,7 +121,7 @@ def sequence_of(entry: Input, into: Path) -> Path:
     if entry.hardship is None:
         return source
     done = entry.hardship
-    parts = entry.source, done.stride, done.max_frames, done.shutter, done.box_px, done.fps
+    parts = [entry.source, *vars(done).values()]
     return make_hard(source, done, into / "-".join(map(str, parts)))
 
 

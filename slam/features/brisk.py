@@ -27,6 +27,8 @@ class FeatureConfig:
     a smaller one has corners where the image is blurred, and for landmarks that come nearer. The
     corner threshold of a layer is the highest of ``thresholds`` at which FAST finds its share, so
     that a blurred frame still has enough keypoints and a frame with much texture takes no longer.
+    In a dark image hardly a corner reaches the lowest: where fewer than ``few_corners`` do, the
+    highest of ``faint_thresholds`` at which so many are found is used.
     Keypoints nearer to the border of their layer than ``border_px`` have no descriptor.
     ``pixel_sigma`` is the standard deviation of a BRISK keypoint at scale 1.
     ``disparity_sigma_px`` is a constant error of the depth's disparity, sigma_z = z^2 / bf *
@@ -35,6 +37,8 @@ class FeatureConfig:
     """
 
     thresholds: tuple[int, ...] = (50, 35, 25, 18, 13, 9)
+    faint_thresholds: tuple[int, ...] = (6, 4)
+    few_corners: int = 200
     layer_shares: tuple[float, ...] = (1.0,)
     max_keypoints: int = 850
     bucket_px: int = 40
@@ -100,7 +104,8 @@ class BriskExtractor:
         self._depth_noise = camera.noise_of_depth(config.disparity_sigma_px)
         self._describer = FixedSizeBrisk(FINEST_SIZE_PX)
         self._border_px = max(config.border_px, self._describer.reach_px)
-        self._fast = {t: cv2.FastFeatureDetector_create(t) for t in config.thresholds}
+        thresholds = (*config.thresholds, *config.faint_thresholds)
+        self._fast = {t: cv2.FastFeatureDetector_create(t) for t in thresholds}
 
     def extract(self, frame: Frame) -> Features:
         """The features of a frame. Pure: the same frame gives the same arrays."""
@@ -164,10 +169,11 @@ class BriskExtractor:
         registered to patches later.
         """
         inside = self._inside(gray)
-        thresholds = self.config.thresholds
-        for lowest in (thresholds[len(thresholds) // 2], thresholds[-1]):
+        thresholds, few = self.config.thresholds, min(self.config.few_corners, enough)
+        steps = [(thresholds[len(thresholds) // 2], enough), (thresholds[-1], few)]
+        for lowest, needed in (*steps, *((t, few) for t in self.config.faint_thresholds)):
             found = self._fast[lowest].detect(gray, inside)
-            if len(found) >= enough:
+            if len(found) >= needed:
                 break
         response = np.array([keypoint.response for keypoint in found])
         usable = (t for t in thresholds if t > lowest and (response >= t).sum() >= enough)

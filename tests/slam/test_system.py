@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from repository import KITCHEN
+from repository import KITCHEN, shared
 from synthetic_view import CAMERA, render_or_black, render_plane
 
 from bmask_slam.config.configuration import resolve
@@ -242,3 +242,19 @@ class WholeImage(NoSegmenter):
         mask = np.ones(image.shape[:2], bool)
         found = certain(1, len(self.labels), 0.9)
         return [Instance(mask, mask_box(mask), 1, found, 0.9, 0.9)]
+
+
+@pytest.mark.parametrize("faint", [True, False])
+def test_real_frames_of_a_dark_room_are_tracked(faint: bool) -> None:
+    """A fifth of the light of freiburg1_rpy, and the noise of a sensor."""
+    sequence, rng = open_sequence(shared("tum_fr1_rpy")), np.random.default_rng(5)
+    features = FeatureConfig() if faint else FeatureConfig(faint_thresholds=())
+    system = SlamSystem(sequence.camera, replace(SystemConfig(), features=features))
+    tracked = 0
+    for k in range(60):
+        frame = sequence.load(k)
+        light = 0.2 * frame.rgb + rng.normal(0, 3, frame.rgb.shape)
+        dark = np.clip(np.rint(light), 0, 255).astype(np.uint8)
+        result = system.process(replace(frame, rgb=dark))
+        tracked += result.status.by_image
+    assert tracked == 60 if faint else tracked < 40

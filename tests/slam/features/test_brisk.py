@@ -88,6 +88,26 @@ def test_the_highest_threshold_with_enough_corners_is_used(contrast: float) -> N
     assert expected <= pixels <= {k.pt for k in found if k.response >= weakest}
 
 
+@pytest.mark.parametrize("contrast", [0.22, 0.15])
+def test_in_a_dark_image_lower_thresholds_are_used(contrast: float) -> None:
+    """The highest of them at which there are enough for a pose; none if a few are found anyway."""
+    rgb = np.rint(20 + contrast * FRONTAL.rgb.astype(float)).astype(np.uint8)
+    frame = dataclasses.replace(FRONTAL, rgb=rgb)
+    config = dataclasses.replace(CONFIG, border_px=40, bucket_px=640, layer_shares=(1.0,))
+    without = extract(frame, dataclasses.replace(config, faint_thresholds=()))
+    assert len(without) < config.few_corners
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    inside = np.zeros_like(gray)
+    inside[40:-40, 40:-40] = 255
+    for threshold in config.faint_thresholds:
+        found = cv2.FastFeatureDetector_create(threshold).detect(gray, inside)
+        if len(found) >= config.few_corners:
+            break
+    assert len(extract(frame, config)) == min(len(found), config.max_keypoints) > len(without)
+    enough = dataclasses.replace(config, few_corners=len(without))
+    assert len(extract(frame, enough)) == len(without)
+
+
 @pytest.mark.parametrize("layer", [0, 1])
 def test_descriptors_equal_opencvs_at_the_same_keypoints(layer: int) -> None:
     """Each descriptor is that of its pixel and angle in its layer."""
