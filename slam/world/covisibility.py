@@ -57,15 +57,15 @@ class CovisiblePaths:
         world = self._world
         ids = np.fromiter(world.keyframes, np.int64)
         poses = np.array([k.T_world_camera for k in world.keyframes.values()])
-        rows = np.repeat(
-            np.arange(len(ids)), [len(k.landmark_ids) for k in world.keyframes.values()]
-        )
-        columns = np.concatenate([k.landmark_ids for k in world.keyframes.values()])
-        used = columns >= 0
-        used[used] = world.landmarks.in_map[columns[used]]
-        rows, columns = rows[used], columns[used]
+        keypoints = [k.landmark_ids for k in world.keyframes.values()]
+        landmarks = np.concatenate(keypoints)
+        used = landmarks >= 0
+        used[used] = world.landmarks.in_map[landmarks[used]]
+        ends = np.cumsum([0, *map(len, keypoints)])  # of each keyframe's, then of those in the map
+        ends = np.concatenate([[0], np.cumsum(used)])[ends]
         shape = len(ids), len(world.landmarks) + 1
-        sees = csr_array((np.ones(len(rows), np.int32), (rows, columns)), shape)
+        ones = np.ones(ends[-1], np.int32)
+        sees = csr_array((ones, landmarks[used], ends), shape)  # without a sort
         shared = (sees @ sees.T).tocoo()
         strong = (shared.data >= MIN_SHARED) & (shared.row < shared.col)
         segments = np.array([k.segment for k in world.keyframes.values()])
@@ -73,7 +73,7 @@ class CovisiblePaths:
         same = segments[order[1:]] == segments[order[:-1]]
         first = np.concatenate([shared.row[strong], order[:-1][same]])
         second = np.concatenate([shared.col[strong], order[1:][same]])
-        pairs = np.unique(np.stack([first, second], axis=1), axis=0)
+        pairs = np.stack(np.divmod(np.unique(first * len(ids) + second), len(ids)), axis=1)
         lengths = step_lengths(poses[pairs[:, 0]], poses[pairs[:, 1]])
         costs = lengths @ [METRES_PER_RAD, 1.0] + 1e-9  # a cost of 0 would be no step
         return ids, poses, csr_array((costs, pairs.T), (len(ids), len(ids)))
