@@ -149,6 +149,14 @@ class Camera:
         middle = np.array([self.width - 1, self.height - 1]) / 2
         return (pixels - middle) * (2 / self.width)
 
+    def share_of_rows(self, rows: Array) -> Array:
+        """Offsets (N,) of rows (N,) below the image's middle, as shares of its height, +-1/2."""
+        return (rows + 0.5) / self.height - 0.5
+
+    def exposed_after_s(self, rows: Array) -> Array:
+        """Seconds (N,) from the exposure of the image's middle row to that of rows (N,)."""
+        return self.rolling_shutter_s * self.share_of_rows(rows)
+
     def distort(self, pixels: Array) -> Array:
         """Pixels (..., 2) in the image as recorded of undistorted ones."""
         normalised = (pixels - self._centre) / self._focal

@@ -44,11 +44,10 @@ class OtherFactors:
 
     def moved(self, shift: Array) -> gtsam.Values:
         """The states, moved by a tangent (S,) in the order of their keys."""
-        step, at = gtsam.VectorValues(), 0
+        zeros, step, at = self.states.zeroVectors(), gtsam.VectorValues(), 0
         for key in sorted(self.states.keys()):
-            dimensions = self.states.zeroVectors().at(key).size
-            step.insert(key, shift[at : at + dimensions])
-            at += dimensions
+            step.insert(key, shift[at : at + zeros.dim(key)])
+            at += zeros.dim(key)
         return self.states.retract(step)
 
     def keep_states(self) -> None:

@@ -30,7 +30,6 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.run_folder.metrics import row
 from bmask_slam.sequences.sequence import Sequence
-from bmask_slam.tracking.rolling_shutter import share_of_rows
 
 NORMAL_95 = 1.96
 MAX_KEYFRAMES = 60
@@ -120,7 +119,7 @@ def stored_problem(run: SavedRun) -> CalibrationProblem | None:
         lag_s=none,
         sigma_px=sigmas[:, 0],
         sigma_inverse=sigmas[:, 2] / bf,
-        shutter_velocity=share_of_rows(pixels[:, 1], camera)[:, None] * motion.velocities,
+        shutter_velocity=camera.share_of_rows(pixels[:, 1])[:, None] * motion.velocities,
     )
     start = parameters_of(camera, camera.depth_scale)
     start[OFFSET], start[BEND] = 0.0, 0.0  # they are in the depths already

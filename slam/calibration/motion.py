@@ -12,7 +12,7 @@ from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.geometry import inverse, se3_log, transform
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices
 from bmask_slam.run_folder.map_file import SavedRun
-from bmask_slam.tracking.rolling_shutter import exposed_after_s, velocities
+from bmask_slam.tracking.rolling_shutter import velocities
 
 MAX_LATE_S, MAX_GAP_S = 1e-3, 0.11
 MIN_DEPTH_M = 0.1
@@ -66,7 +66,7 @@ def as_exposed(pixels: Array, motion: LandmarkMotion, camera: Camera) -> Array:
     """
     if camera.rolling_shutter_s == 0:
         return pixels
-    later_s = exposed_after_s(pixels[:, 1], camera)[:, None]
+    later_s = camera.exposed_after_s(pixels[:, 1])[:, None]
     in_front = motion.points[:, 2:] > MIN_DEPTH_M
     points = np.where(in_front, motion.points, [0.0, 0.0, 1.0])
     moved = camera.project(points + later_s * motion.velocities) - camera.project(points)

@@ -43,7 +43,7 @@ from bmask_slam.graph.calibration.problem import CalibrationProblem
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.run_folder.map_file import SavedRun
-from bmask_slam.tracking.rolling_shutter import share_of_rows, velocities
+from bmask_slam.tracking.rolling_shutter import velocities
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
@@ -165,7 +165,7 @@ def _exposed(points: Array, twist: Array, camera: Camera, shutter_s: float) -> A
     pixels = camera.project(points)
     for _ in range(ITERATIONS):
         rows = np.clip(pixels[:, 1], 0, camera.height - 1)
-        later_s = shutter_s * share_of_rows(rows, camera)
+        later_s = shutter_s * camera.share_of_rows(rows)
         pixels = camera.project(points + later_s[:, None] * velocities(points, twist))
     inside = front & (pixels > 0).all(axis=1)
     inside &= (pixels < [camera.width - 1, camera.height - 1]).all(axis=1)
@@ -227,7 +227,7 @@ class RunProblem:
             lag_s=depths.lag_s,
             sigma_px=found.sigma_px,
             sigma_inverse=np.hypot(nominal, depths.rms),
-            shutter_velocity=share_of_rows(found.pixels[:, 1], camera)[:, None] * moving,
+            shutter_velocity=camera.share_of_rows(found.pixels[:, 1])[:, None] * moving,
         )
         start = parameters_of(self._given, self._given.depth_scale)
         poses, points_world = self._poses[keyframe_rows], self._points[landmark_rows]

@@ -19,7 +19,6 @@ from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.trajectory import nearest_indices
 from bmask_slam.sequences.images import SURFACE_STEP
 from bmask_slam.sequences.sequence import Sequence
-from bmask_slam.tracking.rolling_shutter import share_of_rows
 
 MIN_VIEWS = 2
 MIN_KEYFRAME_VIEWS = 12
@@ -114,7 +113,7 @@ def make_views(
         lag_s=depths.lag_s,
         sigma_px=observations.sigmas_px[:, 0],
         sigma_inverse=np.hypot(nominal, depths.rms),
-        shutter_velocity=share_of_rows(pixels[:, 1], camera)[:, None] * motion.velocities,
+        shutter_velocity=camera.share_of_rows(pixels[:, 1])[:, None] * motion.velocities,
     )
     return views, keyframe_ids, landmark_ids
 

@@ -164,24 +164,22 @@ class LoopCloser:
         view = loop_view(keyframe, world)
         for candidate in candidates:
             others = [k for k in covisible(candidate.keyframe_id) if k not in tried]
-            others = others[: self.config.neighbours]
-            for other in (candidate.keyframe_id, *others):
+            for other in (candidate.keyframe_id, *others[: self.config.neighbours]):
                 here = world.keyframes[other].segment == keyframe.segment
                 if other in tried or here is (paths is None):
                     break
                 tried.add(other)
-                if paths and self.drift.out_of_reach(
-                    paths.way(other, keyframe.id), self.config.gate
-                ):
-                    self.recogniser.dismiss(other, keyframe.id)
+                ends = (other, keyframe.id)
+                if paths and self.drift.out_of_reach(ends, paths, self.config.gate):
+                    self.recogniser.dismiss(*ends)
                     break
                 old = loop_view(world.keyframes[other], world)
                 result = verify_loop(old, view, self._camera, self.config.verification)
                 if isinstance(result, NoLoop):
-                    self._events.loop_refused((other, keyframe.id), result)
+                    self._events.loop_refused(ends, result)
                     break
                 if paths and not self._within_drift(result, world, paths):
-                    self.recogniser.dismiss(other, keyframe.id)
+                    self.recogniser.dismiss(*ends)
                     break
                 found.append(result)
         return found

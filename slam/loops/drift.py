@@ -13,6 +13,7 @@ from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.geometry import adjoint, inverse, se3_exp, se3_log
 from bmask_slam.loops.noise import DIMENSIONS, NoiseConfig
 from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.world.covisibility import CovisiblePaths
 from bmask_slam.world.world_map import WorldMap
 
 ALIKE_FOR_M = 4.0
@@ -82,13 +83,13 @@ class MapDrift:
         limit = 2 * math.log(rules.alike_spacing_m**3 / rules.alike_odds)
         return self.places_look_alike and minus_2_log > limit
 
-    def out_of_reach(self, way: Array, gate: float) -> bool:
-        """Whether any loop between the ends of a way (N, 4, 4) is refused where places look alike.
+    def out_of_reach(self, ends: tuple[int, int], paths: CovisiblePaths, gate: float) -> bool:
+        """Whether any loop between two keyframes is refused where places look alike.
 
         Keyframes that show the same place are within ``reach_m``. Those that the map has further
         apart imply so much drift at least: too much, or less likely than a look-alike.
         """
-        if not (self.places_look_alike and len(way)):
+        if not self.places_look_alike or not len(way := paths.way(*ends)):
             return False
         S_moved = self.covariance(way)[3:, 3:]
         apart_m = float(np.linalg.norm(way[0, :3, 3] - way[-1, :3, 3]))

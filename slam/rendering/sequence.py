@@ -39,7 +39,6 @@ from bmask_slam.rendering.sensors import MARKERS, write_sensors
 from bmask_slam.rendering.things.people import Cast, Role, add_people
 from bmask_slam.rendering.writer import new_folder, stored_depth, write_json, write_lists, write_png
 from bmask_slam.sequences.cameras import write_camera
-from bmask_slam.tracking.rolling_shutter import exposed_after_s
 
 _WORKERS, _SHUTTER_SHARE, _IMAGE_NOISE = 2, 0.6, 2.0
 
@@ -196,7 +195,7 @@ def _poses(job: _Job, time_s: float) -> Array:
     if not config.rolling_shutter_ms:
         return poses_at(job.path, np.array([time_s]), config.seed, config.sweeping)[0]
     camera = replace(job.camera, rolling_shutter_s=config.rolling_shutter_ms / 1e3)
-    rows_s = time_s + exposed_after_s(np.arange(camera.height, dtype=float), camera)
+    rows_s = time_s + camera.exposed_after_s(np.arange(camera.height, dtype=float))
     return poses_at(job.path, rows_s, config.seed, config.sweeping)
 
 

@@ -24,7 +24,6 @@ from bmask_slam.tracking.pose_optimisation import (
     median,
     optimise_pose,
 )
-from bmask_slam.tracking.rolling_shutter import share_of_rows
 from bmask_slam.world.landmark_table import LandmarkTable
 
 SHRUNK = 2
@@ -199,7 +198,7 @@ class ImageMotion:
         if self.camera.rolling_shutter_s and ago_s > 0:
             # A row exposed s intervals later than the middle one shows 1 + s times the motion.
             before = self.camera.project(points[kept])
-            share = share_of_rows(found[:, 1], self.camera)
+            share = self.camera.share_of_rows(found[:, 1])
             later = share * self.camera.rolling_shutter_s / ago_s
             pixels = before + (pixels - before) / (1 + later)[:, None]
         measured = np.column_stack([pixels, np.full(len(kept), np.nan)])

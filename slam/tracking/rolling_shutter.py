@@ -49,16 +49,6 @@ def motion_since(
     return Motion(se3_log(between) / previous.ago_s, ACCELERATION * previous.ago_s)
 
 
-def share_of_rows(rows: Array, camera: Camera) -> Array:
-    """Offsets (N,) of rows (N,) below the image's middle, as shares of its height, -1/2 to 1/2."""
-    return (rows + 0.5) / camera.height - 0.5
-
-
-def exposed_after_s(rows: Array, camera: Camera) -> Array:
-    """Seconds (N,) from the exposure of the image's middle row to that of rows (N,)."""
-    return camera.rolling_shutter_s * share_of_rows(rows, camera)
-
-
 def velocities(points_camera: Array, twist: Array) -> Array:
     """Velocities (N, 3) in m/s of static points (N, 3) in the frame of a moving camera.
 
@@ -116,5 +106,5 @@ def corrected(
 
 def after_mean_row_s(features: Features, camera: Camera) -> Array:
     """Seconds (N,) from the exposure of the keypoints' mean row to that of each."""
-    later_s = exposed_after_s(features.image_pixels[:, 1], camera)
+    later_s = camera.exposed_after_s(features.image_pixels[:, 1])
     return later_s - later_s.mean()

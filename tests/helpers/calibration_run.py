@@ -16,7 +16,6 @@ from bmask_slam.graph.smoother.storage import write_graph
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.rendering.writer import stored_depth, write_lists, write_png
 from bmask_slam.sequences.cameras import write_camera
-from bmask_slam.tracking.rolling_shutter import share_of_rows
 
 HALF_ROOM_M = np.array([1.6, 1.3, 1.7])
 STEP_S, KEYFRAME_STEP_S = 1 / 30, 0.2
@@ -62,7 +61,7 @@ def make_run(
     size = (truth.height, truth.width)
     v, u = np.mgrid[: size[0], : size[1]]
     pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
-    rows_s = truth.rolling_shutter_s * share_of_rows(np.arange(size[0]), truth)
+    rows_s = truth.rolling_shutter_s * truth.share_of_rows(np.arange(size[0]))
     for stamp, time_s in zip(stamps, times_s, strict=True):
         T = camera_path(time_s + delay_s + rows_s).repeat(size[1], axis=0)
         inverse_depth = 1 / (room_depth(T, truth, pixels).reshape(size) - truth.depth_offset_m)
@@ -107,7 +106,7 @@ def _tables(times_s: Array, truth: Camera, used: Camera) -> FactorTables:
 def _rolled(pixels: Array, points_world: Array, times_s: Array, truth: Camera) -> Array:
     """Pixels (K, L, 2) of points (L, 3) when the rows on which they lie are exposed."""
     for _ in range(4 if truth.rolling_shutter_s else 0):
-        later_s = truth.rolling_shutter_s * share_of_rows(pixels[..., 1], truth)
+        later_s = truth.rolling_shutter_s * truth.share_of_rows(pixels[..., 1])
         T = camera_path((times_s[:, None] + later_s.clip(-0.1, 0.1)).ravel())
         points_camera = transform(inverse(T), np.tile(points_world, (len(times_s), 1))[:, None])
         points_camera = points_camera[:, 0]

@@ -15,7 +15,6 @@ from bmask_slam.back_end.reinterpretation import (
 )
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
-from bmask_slam.tracking.rolling_shutter import share_of_rows
 from bmask_slam.world.frame_observations import FrameObservations, FrameView
 from bmask_slam.world.keyframe import Keyframe
 
@@ -31,7 +30,7 @@ def exposed_keyframe() -> tuple[Keyframe, Array]:
     for _ in range(5):
         T = se3_exp(later_s[:, None] * TWIST)
         points = transform(inverse(T), points_world[:, None])[:, 0]
-        later_s = READOUT_S * share_of_rows(CAMERA.project(points)[:, 1], CAMERA)
+        later_s = READOUT_S * CAMERA.share_of_rows(CAMERA.project(points)[:, 1])
     features = make_features(
         np.eye(4), points, random_descriptors(len(points), np.random.default_rng(0))
     )

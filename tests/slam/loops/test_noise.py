@@ -287,10 +287,14 @@ def test_places_out_of_reach_are_those_whose_every_loop_would_be_refused(
     there = straight(length_m // 2)
     way = np.concatenate([there, there[-2::-1]])
     way[:, 1, 3] += np.linspace(0, apart_m, len(way))
-    assert not drift.out_of_reach(way, gate)
+    world, ends = WorldMap(), (0, len(way) - 1)
+    nothing = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
+    for T_world_camera in way:
+        add_keyframe(world, T_world_camera, nothing)
+    paths = CovisiblePaths(world)
+    assert not drift.out_of_reach(ends, paths, gate)
     drift.places_look_alike = True
-    assert drift.out_of_reach(way, gate) == beyond
-    assert not drift.out_of_reach(way[:0], gate)
+    assert drift.out_of_reach(ends, paths, gate) == beyond
     if not beyond:
         return
     S = drift.covariance(way)

@@ -19,7 +19,6 @@ from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.guided_landmarks import Guided, GuidedLandmarks, weighted, with_guided
 from bmask_slam.tracking.image_motion import ImageMotion, ImageMotionConfig, LastView
 from bmask_slam.tracking.results import TrackingStatus
-from bmask_slam.tracking.rolling_shutter import share_of_rows
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 from bmask_slam.world.landmark_table import LandmarkTable
 from bmask_slam.world.world_map import WorldMap
@@ -60,7 +59,7 @@ def test_the_pose_in_the_last_cameras_frame_is_found_without_a_prediction() -> N
 @pytest.mark.parametrize("ago_s", [0.033, 0.1])
 def test_the_rows_of_a_rolling_shutter_are_brought_to_one_moment(ago_s: float) -> None:
     camera = Camera(640, 480, 525.0, 520.0, 318.5, 241.5, rolling_shutter_s=0.025)
-    shares = share_of_rows(np.arange(480.0), camera) * camera.rolling_shutter_s / ago_s
+    shares = camera.share_of_rows(np.arange(480.0)) * camera.rolling_shutter_s / ago_s
     poses = np.stack([T_WORLD_LAST @ se3_exp((1 + s) * STEP) for s in shares])
     features = EXTRACTOR.extract(render_plane(poses))
     motion = ImageMotion(camera, ImageMotionConfig())

@@ -20,7 +20,6 @@ from bmask_slam.tracking.rolling_shutter import (
     at_one_moment,
     corrected,
     motion_since,
-    share_of_rows,
     velocities,
 )
 
@@ -38,7 +37,7 @@ def exposed(points_world: Array, readout_s: float) -> tuple[Features, Array]:
     for _ in range(5):
         T = T_WORLD_CAMERA @ se3_exp(later_s[:, None] * TWIST)
         points = transform(inverse(T), points_world[:, None])[:, 0]
-        later_s = readout_s * share_of_rows(CAMERA.project(points)[:, 1], CAMERA)
+        later_s = readout_s * CAMERA.share_of_rows(CAMERA.project(points)[:, 1])
     names = random_descriptors(len(points), np.random.default_rng(0))
     features = make_features(np.eye(4), points, names)
     return features, T_WORLD_CAMERA @ se3_exp(later_s.mean() * TWIST)
@@ -128,7 +127,7 @@ def test_the_path_of_a_shaken_camera_is_better() -> None:
         swing = np.array([0.12, 0.1, 0.1, 0.15, 0.1, 0.1])
         return se3_exp(swing * np.sin(np.multiply.outer(t, [7.0, 9.0, 8.0, 5.0, 6.0, 4.0])))
 
-    rows_s = 0.025 * share_of_rows(np.arange(480.0), CAMERA)
+    rows_s = 0.025 * CAMERA.share_of_rows(np.arange(480.0))
     frames = [render_plane(path(t + rows_s), i) for i, t in enumerate(times_s)]
     ate_m = {}
     config = SystemConfig(FeatureConfig(max_keypoints=400))
