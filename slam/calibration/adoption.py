@@ -61,6 +61,8 @@ class SelfCalibrationConfig:
         max_s: a time that is surely larger is no readout within a frame's interval, but an error;
             of one that may be, so much is adopted.
         max_bend_sigma, min_bend, max_bend: the same limits of the distortion of depth, in 1/m.
+        surer: what knows the distortion of depth to so small a share of the standard deviation of
+            the one adopted before takes its place.
     """
 
     frames: int = 210
@@ -74,6 +76,7 @@ class SelfCalibrationConfig:
     max_bend_sigma: float = 0.004
     min_bend: float = 0.003
     max_bend: float = 0.1
+    surer: float = 0.75
 
     def limits(self, i: int) -> tuple[float, float, float]:
         """Largest sigma, smallest change and largest value of a parameter."""
@@ -92,6 +95,7 @@ class SelfCalibration:
         text: one line for the summary and the log; "" if nothing could be said.
         looks: how often the run was looked at in vain.
         settled: whether it needs no other look.
+        bend_sigma: standard deviation of the distortion of depth that was adopted, in 1/m.
     """
 
     given: Camera
@@ -99,6 +103,7 @@ class SelfCalibration:
     text: str = ""
     looks: int = 0
     settled: bool = False
+    bend_sigma: float = 0.0
 
     @property
     def adopted(self) -> bool:
@@ -138,6 +143,11 @@ class Estimate:
             and step > max(config.min_change_sigmas * sigma, config.limits(i)[1])
             for i, (step, sigma) in steps.items()
         )
+
+    def is_surer(self, state: SelfCalibration, config: SelfCalibrationConfig) -> bool:
+        """Whether it knows the distortion of depth much better than the estimate adopted before."""
+        sigma = _rms_sigma(self.sigmas[BEND])
+        return self.shows(BENDS[0], config) and sigma < config.surer * state.bend_sigma
 
     def shows(self, i: int, config: SelfCalibrationConfig) -> bool:
         """Whether a parameter is observable; the distortion of depth is so over the whole image."""
@@ -191,10 +201,11 @@ def judged(
     """The state after an estimate, which is of the camera given.
 
     A parameter that does not show yet is looked for again later, unless one was adopted. Only those
-    of ``free`` may be; with a mode other than "auto" it is only told. What was adopted before takes
-    the value of this estimate if that contradicts the camera in use, and stays otherwise.
+    of ``free`` may be; with a mode other than "auto" it is only told. What was adopted before stays
+    unless this estimate contradicts the camera in use or is much surer of the distortion of depth.
     """
-    if state.adopted and not estimate.contradicts(state.camera, config):
+    better = estimate.contradicts(state.camera, config) or estimate.is_surer(state, config)
+    if state.adopted and not better:
         return state
     sure = {i for i in surely_other(estimate, config) if i in free}
     if sure:
@@ -205,7 +216,8 @@ def judged(
         if mode != "auto":
             return dataclasses.replace(state, text=text, settled=True)
         camera = camera_with(state.camera, estimate.found, chosen)
-        return dataclasses.replace(state, camera=camera, text=text, settled=True)
+        sigma = _rms_sigma(estimate.sigmas[BEND]) if BENDS[0] in chosen else 0.0
+        return dataclasses.replace(state, camera=camera, text=text, settled=True, bend_sigma=sigma)
     if state.adopted:
         return state
     seen = [i for i in free if estimate.shows(i, config)]

@@ -269,6 +269,28 @@ def test_the_last_look_replaces_what_was_adopted(
         assert after == before
 
 
+@pytest.mark.parametrize(("sigma", "taken"), [(0.001, True), (0.0018, False)])
+def test_a_much_surer_bend_takes_the_place_of_one_that_it_does_not_contradict(
+    monkeypatch: pytest.MonkeyPatch, sigma: float, taken: bool
+) -> None:
+    """0.020 / m in xx were adopted, known to 0.002; then 0.022 are found."""
+    prove(monkeypatch, 3.0, 3.0)
+    config, camera = SelfCalibrationConfig(), Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+
+    def bent(found: float, sigma: float) -> Estimate:
+        values = np.where(np.arange(18) == BENDS[2], found, 0.0)
+        sigmas = np.where(np.isin(np.arange(18), BENDS), sigma, 0.0)
+        return Estimate(np.zeros(18), values, sigmas, None)  # type: ignore[arg-type]
+
+    first = judged(SelfCalibration(camera, camera), bent(0.020, 0.002), "auto", config)
+    assert first.camera.depth_distortion[2] == 0.020
+    last = bent(0.022, sigma)
+    assert not last.contradicts(first.camera, config)
+    after = judged(first, last, "auto", config)
+    assert after.camera.depth_distortion[2] == (0.022 if taken else 0.020)
+    assert after == first or after.bend_sigma < first.bend_sigma
+
+
 @pytest.mark.parametrize("parallel", [False, True])
 def test_after_the_last_frame_keyframes_get_the_depth_of_the_camera_found(
     late_sweep: Path, sweep_camera: Camera, parallel: bool
