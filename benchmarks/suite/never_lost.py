@@ -38,6 +38,8 @@ from bmask_slam.system_config import SystemConfig
 
 KINECT_V1 = {"rolling_shutter_s": 0.022, "depth_time_offset_s": -0.0145}
 XTION = {"rolling_shutter_s": 0.0248}
+READOUT_S = 0.02
+"""Of rendered rooms."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,6 @@ def fast(config: RenderConfig, speed: int) -> RenderConfig:
     return replace(config, frames=frames, fps=config.fps / speed, rolling_shutter_ms=shutter_ms)
 
 
-READOUT_S = 0.02
 SLOW = {
     "office": RenderConfig("office", frames=300),
     "living_room": RenderConfig("living_room", frames=360),

@@ -33,7 +33,6 @@ class OtherFactors:
         inertial, change = inertial_graph(tables.inertial)
         self._graph = make_graph([*poses, *own_gtsam_factors(tables), *inertial])
         self._tables, self._keys = tables, keyframe_keys(tables.keyframes.ids)
-
         self.states = gtsam.Values()
         insert_states(self.states, tables.inertial, change)
 

@@ -216,7 +216,7 @@ def judged(
         if mode != "auto":
             return dataclasses.replace(state, text=text, settled=True)
         camera = camera_with(state.camera, estimate.found, chosen)
-        sigma = _rms_sigma(estimate.sigmas[BEND]) if BENDS[0] in chosen else 0.0
+        sigma = _rms_sigma(estimate.sigmas[BEND]) if BENDS[0] in chosen else state.bend_sigma
         return dataclasses.replace(state, camera=camera, text=text, settled=True, bend_sigma=sigma)
     if state.adopted:
         return state

@@ -73,6 +73,8 @@ class MapDrift:
         ``alike_spacing_m`` cubed. The longer the way, the less tells even a loop that implies no
         drift.
         """
+        if not self.places_look_alike:
+            return False
         moved, S_moved = implied[None, 3:], S[3:, 3:]
         return self._alike_likelier(float(mahalanobis(moved, S_moved[None])[0]), S_moved)
 
@@ -80,8 +82,7 @@ class MapDrift:
         """Whether a look-alike is likelier than drift by this chi-square, of S_moved (3, 3)."""
         minus_2_log = chi2 + float(np.linalg.slogdet(2 * np.pi * S_moved)[1])
         rules = self.config
-        limit = 2 * math.log(rules.alike_spacing_m**3 / rules.alike_odds)
-        return self.places_look_alike and minus_2_log > limit
+        return minus_2_log > 2 * math.log(rules.alike_spacing_m**3 / rules.alike_odds)
 
     def out_of_reach(self, ends: tuple[int, int], paths: CovisiblePaths, gate: float) -> bool:
         """Whether any loop between two keyframes is refused where places look alike.

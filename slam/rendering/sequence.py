@@ -194,8 +194,8 @@ def _poses(job: _Job, time_s: float) -> Array:
     config = job.config
     if not config.rolling_shutter_ms:
         return poses_at(job.path, np.array([time_s]), config.seed, config.sweeping)[0]
-    camera = replace(job.camera, rolling_shutter_s=config.rolling_shutter_ms / 1e3)
-    rows_s = time_s + camera.exposed_after_s(np.arange(camera.height, dtype=float))
+    shares = job.camera.share_of_rows(np.arange(float(config.height)))
+    rows_s = time_s + config.rolling_shutter_ms / 1e3 * shares
     return poses_at(job.path, rows_s, config.seed, config.sweeping)
 
 

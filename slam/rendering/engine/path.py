@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -39,6 +40,18 @@ class CameraPath:
     turn_deg_s: float = 26.0
     samples: int = 4000
 
+    @cached_property
+    def share_times_s(self) -> Array:
+        """The time at which each of the equal shares of the path is reached."""
+        fine = _at(self, np.linspace(0, 1, self.samples))
+        step_m = np.linalg.norm(np.diff(fine[:, :3, 3], axis=0), axis=1)
+        relative = np.swapaxes(fine[:-1, :3, :3], 1, 2) @ fine[1:, :3, :3]
+        step_deg = np.rad2deg(np.linalg.norm(so3_log(relative), axis=1))
+        slowness = np.maximum(step_m / self.speed_m_s, step_deg / self.turn_deg_s)
+        slowness = np.maximum(gaussian_filter1d(slowness, 60, mode="nearest"), 0.9 * slowness)
+        slowness = gaussian_filter1d(slowness, 25, mode="nearest")
+        return np.r_[0.0, np.cumsum(slowness)]
+
 
 def look_at(eyes: Array, targets: Array) -> Array:
     """Poses T_world_camera (N, 4, 4) with z toward the target, x right and y down; no roll."""
@@ -51,7 +64,7 @@ def look_at(eyes: Array, targets: Array) -> Array:
 
 def camera_poses(path: CameraPath, fps: float, seed: int, sweeping: bool = False) -> Array:
     """The poses T_world_camera (F, 4, 4) of all frames along the path."""
-    stamps = np.arange(int(_share_times_s(path)[-1] * fps) + 1) / fps
+    stamps = np.arange(int(path.share_times_s[-1] * fps) + 1) / fps
     return poses_at(path, stamps, seed, sweeping)
 
 
@@ -68,26 +81,14 @@ def poses_at(path: CameraPath, times_s: Array, seed: int, sweeping: bool = False
 
 def steady_poses(path: CameraPath, times_s: Array) -> Array:
     """Poses T_world_camera (N, 4, 4) along the path at times (N,), without tremor."""
-    shares_s = _share_times_s(path)
+    shares_s = path.share_times_s
     share = np.interp(_eased(times_s, shares_s[-1]), shares_s, np.linspace(0, 1, path.samples))
     return _at(path, share)
 
 
 def duration_s(path: CameraPath) -> float:
     """Duration of the path, with the slow start."""
-    return float(_share_times_s(path)[-1]) + 0.5
-
-
-def _share_times_s(path: CameraPath) -> Array:
-    """The time at which each of the equal shares of the path is reached."""
-    fine = _at(path, np.linspace(0, 1, path.samples))
-    step_m = np.linalg.norm(np.diff(fine[:, :3, 3], axis=0), axis=1)
-    relative = np.swapaxes(fine[:-1, :3, :3], 1, 2) @ fine[1:, :3, :3]
-    step_deg = np.rad2deg(np.linalg.norm(so3_log(relative), axis=1))
-    slowness = np.maximum(step_m / path.speed_m_s, step_deg / path.turn_deg_s)
-    slowness = np.maximum(gaussian_filter1d(slowness, 60, mode="nearest"), 0.9 * slowness)
-    slowness = gaussian_filter1d(slowness, 25, mode="nearest")
-    return np.r_[0.0, np.cumsum(slowness)]
+    return float(path.share_times_s[-1]) + 0.5
 
 
 def _eased(stamps: Array, total_s: float) -> Array:

@@ -98,8 +98,9 @@ class Renderer:
         """Draw one view; rays go through pixel centres, edges of things are supersampled."""
         h, w = self._camera.height, self._camera.width
         layers, tables = _stack(self._static, moving)
-        hits = self._cast(layers, self._pixels, T_world_camera)
-        colour = self._shade(tables, hits, self._pixels, T_world_camera)
+        exposed = _when_exposed(T_world_camera, self._pixels)
+        hits = self._cast(layers, self._pixels, exposed)
+        colour = self._shade(tables, hits, exposed)
         surface = tables[1][hits[1]].reshape(h, w)
         edges = _edges(surface, hits[0].reshape(h, w), colour.reshape(h, w, 3)).ravel()
         colour[edges] = self._supersample(layers, tables, self._pixels[edges], T_world_camera)
@@ -114,7 +115,7 @@ class Renderer:
     ) -> tuple[Floats, Floats]:
         """Depth and normals of `render` alone, at less than half of its time."""
         layers, tables = _stack(self._static, moving)
-        hits = self._cast(layers, self._pixels, T_world_camera)
+        hits = self._cast(layers, self._pixels, _when_exposed(T_world_camera, self._pixels))
         return self._geometry(tables, hits, T_world_camera)
 
     def _geometry(
@@ -135,13 +136,13 @@ class Renderer:
             return np.zeros((0, 3), np.float32)
         offsets = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]], np.float32) / np.float32(4)
         many = (pixels[None] + offsets[:, None]).reshape(-1, 2)
-        hits = self._cast(layers, many, T_world_camera)
-        colour = self._shade(tables, hits, many, T_world_camera)
+        exposed = _when_exposed(T_world_camera, many)
+        colour = self._shade(tables, self._cast(layers, many, exposed), exposed)
         return colour.reshape(4, -1, 3).mean(0)
 
-    def _cast(self, layers: list[Geometry], pixels: Floats, T_world_camera: Array) -> _Hits:
+    def _cast(self, layers: list[Geometry], pixels: Floats, exposed: _Exposed) -> _Hits:
         """Nearest hits of rays whose direction has z = 1 in the camera, so that t is z-depth."""
-        camera, (R, origin) = self._camera, _rows_of(T_world_camera, pixels)
+        camera, (R, origin) = self._camera, exposed
         x = (pixels[:, 0] - np.float32(camera.cx)) / np.float32(camera.fx)
         y = (pixels[:, 1] - np.float32(camera.cy)) / np.float32(camera.fy)
         rays = np.empty((len(pixels), 6), np.float32)
@@ -161,7 +162,7 @@ class Renderer:
             first += len(layer.rows)
         return t, triangle, rays[:, 3:]
 
-    def _shade(self, tables: _Tables, hits: _Hits, pixels: Floats, T_world_camera: Array) -> Floats:
+    def _shade(self, tables: _Tables, hits: _Hits, exposed: _Exposed) -> Floats:
         """Colours (N, 3), black where nothing is hit.
 
         The footprint of a pixel in the texture is exact: with p = o + t d on the plane of normal
@@ -174,7 +175,7 @@ class Renderer:
         texture = tables[1].take(triangle, mode="clip")
         t = np.where(triangle >= 0, t, 1).astype(np.float32)
         A, n, d = rows[:12].reshape(3, 4, -1), rows[12:15], np.ascontiguousarray(d.T)
-        R, origin = _rows_of(T_world_camera, pixels)
+        R, origin = exposed
         points = origin + t * d
         value = [_product(a[:3], points) + a[3] for a in A]
         slope = _product(n, d)
@@ -202,9 +203,10 @@ class Renderer:
 
 _Tables = tuple[Floats, NDArray[np.int32], NDArray[np.int32]]
 _Hits = tuple[Floats, Ints, Floats]
+_Exposed = tuple[Floats, Floats]
 
 
-def _rows_of(T_world_camera: Array, pixels: Floats) -> tuple[Floats, Floats]:
+def _when_exposed(T_world_camera: Array, pixels: Floats) -> _Exposed:
     """Rotations (3, 3, N) and positions (3, N) when pixels (N, 2) are seen; N is 1 if at once."""
     T = T_world_camera.astype(np.float32)
     if T.ndim == 2:

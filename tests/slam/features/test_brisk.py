@@ -1,6 +1,7 @@
 """Keypoints of a rendered plane: bucketing, depth, sigmas, empty images."""
 
 import dataclasses
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from bmask_slam.features.brisk import (
     spread_order,
 )
 from bmask_slam.features.matching import hamming
+from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.camera import KINECT_DISPARITY_SIGMA_PX, Camera, DepthNoise
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import make_pose, se3_exp, so3_exp
@@ -66,6 +68,17 @@ def test_the_same_frame_gives_the_same_arrays() -> None:
             np.testing.assert_array_equal(getattr(other, name), values, err_msg=name)
 
 
+def corners(gray: Image, thresholds: tuple[int, ...], enough: int) -> list[Any]:
+    """FAST's, 40 px inside the image, at the first threshold with enough, or the last."""
+    inside = np.zeros_like(gray)
+    inside[40:-40, 40:-40] = 255
+    for threshold in thresholds:
+        found = list(cv2.FastFeatureDetector_create(threshold).detect(gray, inside))
+        if len(found) >= enough:
+            break
+    return found
+
+
 @pytest.mark.parametrize("contrast", [1.0, 0.7, 0.5, 0.3])
 def test_the_highest_threshold_with_enough_corners_is_used(contrast: float) -> None:
     """Equal to FAST at one threshold after the other, also for images with low contrast."""
@@ -75,12 +88,7 @@ def test_the_highest_threshold_with_enough_corners_is_used(contrast: float) -> N
     config = dataclasses.replace(
         CONFIG, border_px=40, bucket_px=640, max_keypoints=500, layer_shares=(1.0,)
     )
-    inside = np.zeros_like(gray)
-    inside[40:-40, 40:-40] = 255
-    for threshold in config.thresholds:
-        found = cv2.FastFeatureDetector_create(threshold).detect(gray, inside)
-        if len(found) >= config.max_keypoints:
-            break
+    found = corners(gray, config.thresholds, config.max_keypoints)
     best = sorted(found, key=lambda k: -k.response)[: config.max_keypoints]
     weakest = best[-1].response
     expected = {k.pt for k in found if k.response > weakest}
@@ -97,12 +105,7 @@ def test_in_a_dark_image_lower_thresholds_are_used(contrast: float) -> None:
     without = extract(frame, dataclasses.replace(config, faint_thresholds=()))
     assert len(without) < config.few_corners
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    inside = np.zeros_like(gray)
-    inside[40:-40, 40:-40] = 255
-    for threshold in config.faint_thresholds:
-        found = cv2.FastFeatureDetector_create(threshold).detect(gray, inside)
-        if len(found) >= config.few_corners:
-            break
+    found = corners(gray, config.faint_thresholds, config.few_corners)
     assert len(extract(frame, config)) == min(len(found), config.max_keypoints) > len(without)
     enough = dataclasses.replace(config, few_corners=len(without))
     assert len(extract(frame, enough)) == len(without)
