@@ -24,7 +24,7 @@ from bmask_slam.loops.drift import MapDrift, implied_drift
 from bmask_slam.loops.noise import Cycles, LoopNoise, NoiseConfig
 from bmask_slam.loops.place_recognition import PlaceConfig, PlaceRecogniser
 from bmask_slam.loops.verification import LoopConfig, LoopConstraint, NoLoop, loop_view, verify_loop
-from bmask_slam.world.covisibility import CovisiblePaths
+from bmask_slam.world.covisibility import CovisiblePaths, Neighbours
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
@@ -77,7 +77,7 @@ class LoopCloser:
         self.waiting: list[LoopConstraint] = []
         self.closed: dict[tuple[int, int], bool] = {}
         """Ends of the closed loops, and whether each is trusted more than the graph."""
-        self._camera, self._events = camera, events
+        self._camera, self._events, self._neighbours = camera, events, Neighbours()
 
     def state(self) -> Arrays:
         """Closed loops, waiting loops, and the results of the last query."""
@@ -103,6 +103,7 @@ class LoopCloser:
 
     def restore(self, state: Arrays, world: WorldMap) -> None:
         """Restore a state, with the keyframes of a map."""
+        self._neighbours = Neighbours()
         self.index.restore({k.id: k.features.descriptors for k in world.keyframes.values()})
         self.recogniser.restore(part(state, "recogniser"))
         self.noise.restore(part(state, "noise"))
@@ -140,7 +141,7 @@ class LoopCloser:
         """Loops from a new keyframe that are confirmed now, and those that they confirm."""
         if not self.config.enabled:
             return []
-        paths = CovisiblePaths(world)
+        paths = CovisiblePaths(world, self._neighbours)
         return self.confirm(self.propose(keyframe, world, paths), world, paths)
 
     def propose(

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.geometry import step_lengths
 from bmask_slam.world.world_map import WorldMap
 
@@ -16,6 +16,60 @@ MIN_SHARED = 15
 """Keyframes are neighbours if they share so many landmarks, or follow each other in a segment."""
 METRES_PER_RAD = 1.0
 """As much path counts a turn when ways are compared."""
+FEW = 0.1
+"""Share of the keyframes up to which those that changed are counted one by one, not all at once."""
+_BASE = 1 << 32
+"""A pair of keyframes is one number: the id of the older times this, plus that of the newer."""
+
+
+class Neighbours:
+    """Which keyframes of a map are neighbours, and what a step from one to the other costs.
+
+    From one question to the next it counts and measures again only what changed since: keyframes
+    whose observations changed, and those that moved. It answers as a new one would.
+    """
+
+    def __init__(self) -> None:
+        """Nothing is known before the first question."""
+        self._revisions: dict[int, int] = {}
+        self._in_map = np.zeros(0, bool)
+        self._strong = np.zeros(0, np.int64)  # pairs that share enough landmarks
+        self._ids, self._poses = np.zeros(0, np.int64), np.zeros((0, 4, 4))
+        self._pairs, self._costs = np.zeros(0, np.int64), np.zeros(0)
+
+    def steps(self, world: WorldMap) -> tuple[Ints, Array, csr_array]:
+        """Ids (K,), T_world_camera (K, 4, 4), and costs (K, K), of each pair one way alone."""
+        ids = np.fromiter(world.keyframes, np.int64)
+        poses = np.array([k.T_world_camera for k in world.keyframes.values()])
+        self._count(world)
+        pairs = np.union1d(self._strong, _consecutive(world, ids))
+        first, second = np.searchsorted(ids, np.divmod(pairs, _BASE))
+        known, before = _found(pairs, self._pairs)
+        stays, there = _found(ids, self._ids)
+        stays[stays] = (poses[stays] == self._poses[there[stays]]).all(axis=(1, 2))
+        known &= stays[first] & stays[second]
+        costs = np.empty(len(pairs))
+        costs[known] = self._costs[before[known]]
+        lengths = step_lengths(poses[first[~known]], poses[second[~known]])
+        costs[~known] = lengths @ [METRES_PER_RAD, 1.0] + 1e-9  # a cost of 0 would be no step
+        self._ids, self._poses, self._pairs, self._costs = ids, poses, pairs, costs
+        return ids, poses, csr_array((costs, (first, second)), (len(ids), len(ids)))
+
+    def _count(self, world: WorldMap) -> None:
+        """Find the pairs that share MIN_SHARED landmarks."""
+        revisions = {k.id: k.revision for k in world.keyframes.values()}
+        changed = {k for k, revision in revisions.items() if self._revisions.get(k) != revision}
+        in_map = world.landmarks.in_map
+        removed = np.flatnonzero(self._in_map & ~in_map[: len(self._in_map)])
+        changed |= {k.id for k in world.observing(removed)}
+        if len(changed) > FEW * len(revisions):
+            self._strong = _all_pairs(world)
+        else:
+            stale = np.zeros(world.next_keyframe_id, bool)
+            stale[[*changed, *(self._revisions.keys() - revisions.keys())]] = True
+            kept = self._strong[~stale[np.stack(np.divmod(self._strong, _BASE))].any(axis=0)]
+            self._strong = np.union1d(kept, _pairs_of(sorted(changed), world))
+        self._revisions, self._in_map = revisions, in_map.copy()
 
 
 class CovisiblePaths:
@@ -25,9 +79,9 @@ class CovisiblePaths:
     two rooms the map can drift on the way from door to door, however long each was walked through.
     """
 
-    def __init__(self, world: WorldMap) -> None:
+    def __init__(self, world: WorldMap, neighbours: Neighbours | None = None) -> None:
         """Nothing is computed before the first way is asked for."""
-        self._world = world
+        self._world, self._neighbours = world, neighbours or Neighbours()
         self._before: dict[int, Ints] = {}  # of each b, the keyframe before each on the way from it
 
     def way(self, a: int, b: int) -> Array:
@@ -53,27 +107,46 @@ class CovisiblePaths:
 
     @cached_property
     def _graph(self) -> tuple[Ints, Array, csr_array]:
-        """Ids (K,), T_world_camera (K, 4, 4), and what steps between neighbours (K, K) cost."""
-        world = self._world
-        ids = np.fromiter(world.keyframes, np.int64)
-        poses = np.array([k.T_world_camera for k in world.keyframes.values()])
-        keypoints = [k.landmark_ids for k in world.keyframes.values()]
-        landmarks = np.concatenate(keypoints)
-        used = landmarks >= 0
-        used[used] = world.landmarks.in_map[landmarks[used]]
-        ends = np.cumsum([0, *map(len, keypoints)])  # of each keyframe's, then of those in the map
-        ends = np.concatenate([[0], np.cumsum(used)])[ends]
-        shape = len(ids), len(world.landmarks) + 1
-        ones = np.ones(ends[-1], np.int32)
-        sees = csr_array((ones, landmarks[used], ends), shape)  # without a sort
-        shared = (sees @ sees.T).tocoo()
-        strong = (shared.data >= MIN_SHARED) & (shared.row < shared.col)
-        segments = np.array([k.segment for k in world.keyframes.values()])
-        order = np.argsort(segments, kind="stable")
-        same = segments[order[1:]] == segments[order[:-1]]
-        first = np.concatenate([shared.row[strong], order[:-1][same]])
-        second = np.concatenate([shared.col[strong], order[1:][same]])
-        pairs = np.stack(np.divmod(np.unique(first * len(ids) + second), len(ids)), axis=1)
-        lengths = step_lengths(poses[pairs[:, 0]], poses[pairs[:, 1]])
-        costs = lengths @ [METRES_PER_RAD, 1.0] + 1e-9  # a cost of 0 would be no step
-        return ids, poses, csr_array((costs, pairs.T), (len(ids), len(ids)))
+        return self._neighbours.steps(self._world)
+
+
+def _consecutive(world: WorldMap, ids: Ints) -> Ints:
+    """The pairs of keyframes that follow each other in a segment."""
+    segments = np.array([k.segment for k in world.keyframes.values()])
+    order = np.argsort(segments, kind="stable")
+    same = segments[order[1:]] == segments[order[:-1]]
+    return ids[order[:-1][same]] * _BASE + ids[order[1:][same]]
+
+
+def _all_pairs(world: WorldMap) -> Ints:
+    """All pairs that share MIN_SHARED landmarks, by a product of sparse matrices."""
+    ids = np.fromiter(world.keyframes, np.int64)
+    keypoints = [k.landmark_ids for k in world.keyframes.values()]
+    landmarks = np.concatenate(keypoints)
+    used = landmarks >= 0
+    used[used] = world.landmarks.in_map[landmarks[used]]
+    ends = np.cumsum([0, *map(len, keypoints)])  # of each keyframe's, then of those in the map
+    ends = np.concatenate([[0], np.cumsum(used)])[ends]
+    ones = np.ones(ends[-1], np.int32)
+    sees = csr_array((ones, landmarks[used], ends), (len(ids), len(world.landmarks) + 1))
+    shared = (sees @ sees.T).tocoo()
+    strong = (shared.data >= MIN_SHARED) & (shared.row < shared.col)
+    return np.sort(ids[shared.row[strong]] * _BASE + ids[shared.col[strong]])
+
+
+def _pairs_of(keyframe_ids: list[int], world: WorldMap) -> Ints:
+    """The pairs of these keyframes with others that share MIN_SHARED landmarks with them."""
+    found = []
+    for k in keyframe_ids:
+        _, landmarks = world.observed(world.keyframes[k])
+        others = [other.id for _, other in world.covisible(landmarks, MIN_SHARED)]
+        found += [min(k, other) * _BASE + max(k, other) for other in others if other != k]
+    return np.array(found, np.int64)
+
+
+def _found(values: Ints, among: Ints) -> tuple[Mask, Ints]:
+    """Which of the values (N,) are among others, which ascend, and where."""
+    places = np.searchsorted(among, values)
+    known = places < len(among)
+    known[known] = among[places[known]] == values[known]
+    return known, places

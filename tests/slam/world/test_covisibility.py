@@ -7,7 +7,7 @@ import pytest
 from synthetic_view import add_keyframe, make_features
 
 from bmask_slam.graph.geometry import se3_exp
-from bmask_slam.world.covisibility import MIN_SHARED, CovisiblePaths
+from bmask_slam.world.covisibility import MIN_SHARED, CovisiblePaths, Neighbours
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
@@ -64,3 +64,48 @@ def test_segments_have_no_way_between_them() -> None:
     assert paths.way(0, 5).shape == (0, 4, 4)
     assert np.isinf(paths.length_m(0, 5))
     assert [paths.length_m(*ends) for ends in ((4, 6), (3, 8))] == [1, 1]
+
+
+def change_at_random(world: WorldMap, rng: np.random.Generator) -> None:
+    """One of the changes that a map goes through, of keyframes chosen at random."""
+    first, second = (world.keyframes[k] for k in rng.choice([*world.keyframes], 2, replace=False))
+    mine, others = (np.flatnonzero(k.landmark_ids >= 0) for k in (first, second))
+    match rng.integers(6):
+        case 0:
+            rows = np.flatnonzero(first.free)[:20]
+            ids = world.make_landmarks(first, rows, rng.uniform(size=(len(rows), 3)))
+            free = np.flatnonzero(second.free)[: len(ids)]
+            world.attach(second, free, ids[: len(free)])
+        case 1:
+            world.detach(first, mine[: rng.integers(10)])
+        case 2:
+            world.landmarks.remove(world.landmarks.remaining(first.landmark_ids[mine[:3]]))
+        case 3 if len(world.keyframes) > 6:
+            world.remove_keyframe(first, second)
+        case 4:
+            first.T_world_camera = first.T_world_camera @ se3_exp(rng.normal(size=6))
+        case 5:
+            ids = np.setdiff1d(second.landmark_ids[others[:4]], first.landmark_ids)
+            own = np.setdiff1d(first.landmark_ids[mine[:4]], second.landmark_ids)
+            count = min(len(ids), len(own))
+            world.replace_landmarks(ids[:count], own[:count])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_neighbours_that_follow_a_map_are_those_of_a_new_look(
+    share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bmask_slam.world.covisibility.FEW", share)
+    world, _ = out_and_back()
+    neighbours, rng = Neighbours(), np.random.default_rng(3)
+    most = 0
+    for _ in range(150):
+        for _ in range(rng.integers(1, 4)):
+            change_at_random(world, rng)
+        ids, poses, costs = neighbours.steps(world)
+        new_ids, new_poses, new_costs = Neighbours().steps(world)
+        np.testing.assert_array_equal(ids, new_ids)
+        np.testing.assert_array_equal(poses, new_poses)
+        np.testing.assert_array_equal(costs.toarray(), new_costs.toarray())
+        most = max(most, costs.nnz - len(ids) + 1)
+    assert most > 1  # landmarks made neighbours of some that do not follow each other
