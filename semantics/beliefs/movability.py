@@ -85,9 +85,17 @@ class MovabilityFilter:
         """Which of any ids (N,) are more likely moving than not."""
         return self.log_odds(ids) > 0
 
-    def known(self) -> Ints:
-        """Ids (N,) with a prior or evidence, ascending."""
-        return np.flatnonzero((self._evidence != 0) | (self._prior != self._unknown))
+    def known_moving(self) -> Ints:
+        """Ids (N,) with a prior or evidence that are more likely moving than not, ascending."""
+        ids = np.flatnonzero(self._prior + self._evidence > 0)
+        return ids[(self._evidence[ids] != 0) | (self._prior[ids] != self._unknown)]
+
+    def known(self, without: Mask | None = None) -> Ints:
+        """Ids (N,) with a prior or evidence, ascending, but for those of a mask (M,) of all ids."""
+        known = (self._evidence != 0) | (self._prior != self._unknown)
+        if without is not None:
+            known[: len(without)] &= ~without[: len(known)]
+        return np.flatnonzero(known)
 
     def move(self, from_ids: Ints, to_ids: Ints) -> None:
         """Add the evidence of from_ids (N,) to that of to_ids (N,): each pair is one thing."""

@@ -134,7 +134,7 @@ class MovingObjectFilter:
     def remove_moving(self) -> None:
         """Take the landmarks that move out of the map, before the graph gets a new keyframe."""
         self.landmarks.follow_map()
-        self.landmarks.remove_moving(self.landmarks.movability.known())
+        self.landmarks.remove_moving(self.landmarks.movability.known_moving())
 
     def store_keyframe(self, keyframe: Keyframe, static: StaticFeatures) -> None:
         """A keyframe was made: keep its depth.

@@ -60,8 +60,11 @@ def test_fused_landmarks_share_evidence_and_dropped_ones_are_unknown() -> None:
     movability.move(IDS[1:], IDS[:1])
     expected = np.log(9) + movability.config.step
     np.testing.assert_allclose(movability.log_odds(IDS), [expected, np.log(0.25)], rtol=1e-5)
+    assert movability.known().tolist() == movability.known_moving().tolist() == IDS[:1].tolist()
+    assert not len(movability.known(without=np.arange(4) == IDS[0]))
     movability.drop(IDS)
     assert not len(movability.known())
+    assert not len(movability.known_moving())
 
 
 def test_the_state_is_restored() -> None:
