@@ -49,6 +49,10 @@ class InverseDepthMap:
         """The same map, unknown in ``hidden`` (H, W)."""
         return self.where(torch.from_numpy(~hidden).to(self.rho.device))
 
+    def cpu(self) -> InverseDepthMap:
+        """The same map in the memory of the processor."""
+        return InverseDepthMap(self.rho.cpu(), self.variance.cpu())
+
     def depth_m(self) -> Floats:
         """Depth (H, W) in metres, NaN where missing."""
         return np.asarray((1 / self.rho).cpu().numpy(), np.float32)

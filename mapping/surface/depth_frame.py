@@ -9,27 +9,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bmask_slam.graph.arrays import Array, Image, Mask
+from bmask_slam.graph.arrays import Array, Floats, Image, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.mapping.inverse_depth.backprojection import back_project, surface_normals
+from bmask_slam.mapping.inverse_depth.backprojection import surface_normals
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
+from bmask_slam.mapping.surface.pixel_planes import WITNESS, paint_of_pixels, planes_of_pixels
 
-MIN_COSINE = 0.15
-"""Pixels whose surface is seen at a flatter angle are left out."""
-MIN_SIGMA_M = 0.01
-"""Error of a distance beside that of its own pixel: of the pose and of the sensor's calibration."""
-BEHIND_SIGMAS, BEHIND_VOXELS = 3.0, (3, 8)
-RIM, RIM_M, RIM_BEHIND_VOXELS = 0.1, 0.01, 2
-"""Weight of pixels beside a step of depth or a hole, which must be so near to the plane of a pixel
-beside them, and how far behind the surface they count."""
-NEIGHBOURS = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx]
+BEHIND_VOXELS, RIM_BEHIND_VOXELS = (3, 8), 2
+"""How far behind the surface distances count: at least and at most, and at rims."""
 SILHOUETTE_PX = 3
 """Silhouettes of depth are not exact to a pixel."""
-PAINT_PX, GLARE, FAINT = 8, 250, 0.01
-"""Colours so near to a rim or hole, which may be those of what is in front, and colours as bright
-as the camera can tell, hardly count."""
-SIGHT = (0.05, 4.0)
-"""Least and largest weight cos(angle) / z^2, in 1/m^2, of a view's colour."""
+PAINT_PX = 8
+"""Colours so near to a rim or hole, which may be those of what is in front, hardly count."""
 DARKEST, BRIGHTEST = 16.0, 240.0
 """Colours beyond these are cut off by the camera, or noise."""
 MIN_PIXELS, MAX_GAIN = 100, 2.5
@@ -38,8 +29,6 @@ PULL = 0.95
 UNEXPLAINED = 0.0875
 """How much a frame counts as a witness of a surface that the keyframes did not see: twelve are
 needed for one."""
-NX, NY, NZ, OFFSET, WEIGHT, Z, BEHIND, WITNESS = range(8)
-"""Columns of ``DepthFrame.pixels``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,74 +58,36 @@ def depth_frame(
 
     A voxel's distance is that to the plane of the pixel on which it falls: normal . (q - p), which
     unlike a difference of depths has no bias on a slope and none by rounding to a pixel. Its
-    variance is (sigma_z cos(angle))^2 + MIN_SIGMA_M^2. Beside steps of depth and holes, where a
+    variance is (sigma_z cos(angle))^2 + MIN_VARIANCE_M2. Beside steps of depth and holes, where a
     sensor's depth may be of neither side, a pixel counts RIM, on the plane of a neighbour, or not.
     """
-    points = back_project(measured, camera)
-    normals = surface_normals(measured, camera)
-    rims = _extend(normals, points)
-    offset, z = (normals * points).sum(-1), points[..., 2]
-    cosine = -offset / torch.linalg.norm(points, dim=-1)
-    variance = (measured.variance.sqrt() * z.square() * cosine).square() + MIN_SIGMA_M**2
-    good = (cosine > MIN_COSINE) & torch.isfinite(variance)
-    least, most = BEHIND_VOXELS
-    behind_m = (BEHIND_SIGMAS * variance.sqrt()).clamp(least * voxel_m, most * voxel_m)
-    columns = {
-        OFFSET: offset,
-        WEIGHT: torch.where(rims, RIM, 1.0) * 1e-4 / variance,
-        Z: z,
-        BEHIND: torch.where(rims, RIM_BEHIND_VOXELS * voxel_m, behind_m),
-        WITNESS: torch.ones_like(z),
-    }
-    pixels = torch.empty((*z.shape, 8))
-    pixels[..., :3] = normals
-    for column, values in columns.items():
-        pixels[..., column] = values
-    pixels[~good] = 0
-    pixels = pixels.reshape(-1, 8)
-    inner = pixels[:, Z] * ~rims.reshape(-1)
-    clear = _least_around(inner, z.shape, PAINT_PX) > 0
-    sight = (cosine / z.square()).reshape(-1).nan_to_num_().clamp_(*SIGHT)
-    free_m = _least_around(z.nan_to_num(), z.shape, SILHOUETTE_PX)
-    return DepthFrame(pixels, free_m, _paint(rgb, clear, sight), T_world_camera)
+    rho, shape = measured.rho.numpy(), measured.rho.shape
+    normals = surface_normals(measured, camera).numpy()
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    behind_m = [voxel_m * voxels for voxels in (*BEHIND_VOXELS, RIM_BEHIND_VOXELS)]
+    pixels, paint = np.empty((*shape, 8), np.float32), np.empty((rho.size, 4), np.float32)
+    known_m, inner_m, sight = (np.empty(shape, np.float32) for _ in range(3))
+    planes_of_pixels(
+        (rho, measured.variance.numpy(), normals),
+        tuple(map(np.float32, intrinsics)),
+        tuple(map(np.float32, behind_m)),
+        (pixels, known_m, inner_m, sight),
+    )
+    clear = _least_around(inner_m, PAINT_PX) > 0
+    paint_of_pixels(rgb.reshape(-1, 3), clear.reshape(-1), sight.reshape(-1), paint)
+    free_m = _least_around(known_m, SILHOUETTE_PX).reshape(-1)
+    made = (pixels.reshape(-1, 8), free_m, paint)
+    return DepthFrame(*map(torch.from_numpy, made), T_world_camera)
 
 
-def _paint(rgb: Image, clear: Tensor, sight: Tensor) -> Tensor:
-    """Colours (H W, 4) with their weights, of which clear pixels (H W,) have the full ``sight``."""
-    colours = torch.from_numpy(rgb).reshape(-1, 3).to(torch.float32)
-    weight = sight * torch.where(clear & (colours < GLARE).all(1), 1, FAINT)
-    return torch.cat([colours, weight[:, None]], 1)
-
-
-def _least_around(values: Tensor, shape: torch.Size, radius: int) -> Tensor:
-    """The least value (H W,) in the square around each pixel of an image of this shape."""
-    square = np.ones((2 * radius + 1,) * 2, np.uint8)
-    return torch.from_numpy(cv2.erode(values.reshape(shape).numpy(), square)).reshape(-1)
+def _least_around(values: Floats, radius: int) -> Floats:
+    """The least value (H, W) in the square around each pixel."""
+    return np.asarray(cv2.erode(values, np.ones((2 * radius + 1,) * 2, np.uint8)), np.float32)
 
 
 def mark_unexplained(frame: DepthFrame, unexplained: Mask) -> None:
     """Let pixels (H, W) count less as witnesses, in place."""
     frame.pixels[torch.from_numpy(unexplained.reshape(-1)), WITNESS] = UNEXPLAINED
-
-
-def _extend(normals: Tensor, points: Tensor) -> Tensor:
-    """Give points (H, W, 3) without a normal that of a neighbour on whose plane they lie, in place.
-
-    Returns which they are (H, W): those beside a hole or a step of depth.
-    """
-    lone = torch.isfinite(points[..., 2]) & ~torch.isfinite(normals[..., 0])
-    lone[[0, -1]] = lone[:, [0, -1]] = False
-    rows, columns = torch.nonzero(lone).unbind(-1)
-    own, best = points[rows, columns], torch.full((len(rows),), RIM_M)
-    found = torch.full((len(rows), 3), torch.nan)
-    for dy, dx in NEIGHBOURS:
-        at = rows + dy, columns + dx
-        normal = normals[at]
-        apart = ((own - points[at]) * normal).sum(-1).abs()
-        nearer = apart < best  # never where NaN
-        best, found = torch.where(nearer, apart, best), torch.where(nearer[:, None], normal, found)
-    normals[rows, columns] = found
-    return lone
 
 
 def gains(seen: Tensor, known: Tensor) -> Tensor:

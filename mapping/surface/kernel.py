@@ -2,49 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-import numba
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Floats, Ints
-from bmask_slam.mapping.surface.depth_frame import (
-    BEHIND,
-    NX,
-    NY,
-    NZ,
-    OFFSET,
-    WEIGHT,
-    WITNESS,
-    Z,
-)
+from bmask_slam.mapping.compiled import compiled
+from bmask_slam.mapping.surface.pixel_planes import BEHIND, NX, NY, NZ, OFFSET, WEIGHT, WITNESS, Z
 
-HALVES: Floats = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)
-"""The value of each float16, by its bits."""
-HALF_MAX = 6e4
+HALF_MAX = np.float32(6e4)
 """Weights of colours are cut off here, below the largest float16."""
-NEAREST_M = 0.1
+NEAREST_M = np.float32(0.1)
 Places = tuple[Floats, Floats]
 """(N, 3) the first voxels of bricks in the camera, and (V, 3) a brick's voxels from there, m."""
 View = tuple[float, float, float, float, int, int]
 """fx, fy, cx, cy, width and height of a camera, in pixels."""
-Images = tuple[Floats, Floats, Floats]
-"""pixels (H W, 8), free_m (H W,) and paint (H W, 4) of a ``DepthFrame``."""
+Images = tuple[Floats, Floats, Floats, tuple[float, float, float]]
+"""pixels (H W, 8), free_m (H W,) and paint (H W, 4) of a ``DepthFrame``, and factors of its red,
+green and blue."""
 Reach = tuple[float, float, float, float]
 """Edge of a voxel, where distances in front are cut off, how near voxels take colour, all in
 metres, and the share of a ray's free depth that is kept."""
-Tables = tuple[Floats, Floats, Array, Array, Array, Floats]
+Tables = tuple[Floats, Floats, Array, Array, Array]
 """Distance and weight (B, V) as float32, witnesses, free (B, V) and colour (B, V, 4) as the bits of
-float16, of all bricks; and HALVES."""
-_LEAST_NORMAL, _EXPONENTS, _LEAST_SHARE = 0x38800000, 0x38000000, 1 << 24
-
-
-def compiled(function: Callable) -> Callable:
-    """The function compiled when it is first called; kept on disk where there is a place for it."""
-    try:
-        return numba.njit(cache=True, nogil=True)(function)
-    except RuntimeError:  # neither beside the source nor in the user's cache
-        return numba.njit(nogil=True)(function)
+float16, of all bricks."""
+ONE = np.float32(1)
+_LEAST_NORMAL, _EXPONENTS = np.uint32(0x38800000), np.uint32(0x38000000)
+"""The least float32 that is a normal float16, and what the exponents of the two differ by, bits."""
+_NORMAL, _SHIFT, _ROUND, _LAST = 0x400, np.uint32(13), np.uint32(0xFFF), np.uint32(1)
+_SMALL = np.float32(1 << 24)
 
 
 @compiled
@@ -52,22 +36,23 @@ def half_bits(value: float) -> np.uint16:
     """The float16 nearest to a float32 from 0 to HALF_MAX, as bits; of two the even one."""
     bits = np.float32(value).view(np.uint32)
     if bits < _LEAST_NORMAL:
-        return np.uint16(np.rint(value * np.float32(_LEAST_SHARE)))
-    return np.uint16((bits - _EXPONENTS + 0xFFF + ((bits >> 13) & 1)) >> 13)
+        return np.uint16(np.rint(value * _SMALL))
+    return np.uint16((bits - _EXPONENTS + _ROUND + ((bits >> _SHIFT) & _LAST)) >> _SHIFT)
 
 
 @compiled
-def blend(
-    colour: Array, at: tuple[int, int], paint: Floats, pixel: int, weight: float, halves: Floats
-) -> None:
-    """Add the colour of a pixel, its weight times another one, to the mean of a voxel, in place."""
-    b, k = at
-    before, added = halves[colour[b, k, 3]], weight * paint[pixel, 3]
-    share = added / (before + added)
-    for c in range(3):
-        old = halves[colour[b, k, c]]
-        colour[b, k, c] = half_bits(old + share * (paint[pixel, c] - old))
-    colour[b, k, 3] = half_bits(min(before + added, np.float32(HALF_MAX)))
+def half_value(bits: np.uint16) -> np.float32:
+    """The value of a float16 >= 0, by its bits."""
+    if bits < _NORMAL:
+        return np.float32(bits) / _SMALL
+    return np.uint32((np.uint32(bits) << _SHIFT) + _EXPONENTS).view(np.float32)
+
+
+@compiled
+def blended(bits: np.uint16, colour: float, share: float) -> np.uint16:
+    """A mean, as the bits of a float16, moved by a share of the way to a colour."""
+    mean = half_value(bits)
+    return half_bits(mean + share * (colour - mean))
 
 
 @compiled
@@ -76,7 +61,8 @@ def pixel_at(x: float, y: float, z: float, view: View) -> int:
     fx, fy, cx, cy, width, height = view
     if z <= NEAREST_M:
         return -1
-    u, v = np.rint(x / z * fx + cx), np.rint(y / z * fy + cy)
+    rho = ONE / z
+    u, v = np.rint(x * rho * fx + cx), np.rint(y * rho * fy + cy)
     if u < 0 or u >= width or v < 0 or v >= height:
         return -1
     return int(v) * width + int(u)
@@ -88,28 +74,35 @@ def add_to_brick(
 ) -> None:
     """``add_frame`` for one of its bricks: its number n among them, and its row in the tables."""
     n, b = brick
-    (corners, offsets), (pixels, free_m, paint) = places, images
+    (corners, offsets), (pixels, free_m, paint, gain) = places, images
     voxel_m, front, near, kept = reach
-    distance, weight, witnesses, free, colour, halves = tables
+    distance, weight, witnesses, free, colour = tables
+    first_x, first_y, first_z = corners[n, 0], corners[n, 1], corners[n, 2]
     for k in range(len(offsets)):
-        x, y = corners[n, 0] + offsets[k, 0], corners[n, 1] + offsets[k, 1]
-        z = corners[n, 2] + offsets[k, 2]
+        x, y, z = first_x + offsets[k, 0], first_y + offsets[k, 1], first_z + offsets[k, 2]
         p = pixel_at(x, y, z, view)
         if p < 0:
             continue
         if z < free_m[p] * kept - front:
-            free[b, k] = half_bits(halves[free[b, k]] + np.float32(1))
+            free[b, k] = half_bits(half_value(free[b, k]) + ONE)
         behind, w = pixels[p, BEHIND], pixels[p, WEIGHT]
         d = pixels[p, NX] * x + pixels[p, NY] * y + pixels[p, NZ] * z - pixels[p, OFFSET]
-        if w <= 0 or d <= -behind or z >= pixels[p, Z] + 2 * behind:
+        if w <= 0 or d <= -behind or z >= pixels[p, Z] + behind + behind:
             continue
         d = min(d, front)
-        added = w * min((d + behind) / (behind - voxel_m), np.float32(1))
-        weight[b, k] += added
-        distance[b, k] += added / weight[b, k] * (d - distance[b, k])
-        if abs(d) < near:
-            witnesses[b, k] = half_bits(halves[witnesses[b, k]] + pixels[p, WITNESS])
-            blend(colour, (b, k), paint, p, w, halves)
+        added = w if d > -voxel_m else w * (d + behind) / (behind - voxel_m)
+        total = weight[b, k] + added
+        weight[b, k] = total
+        distance[b, k] += added / total * (d - distance[b, k])
+        if abs(d) < near:  # written out, which is a third faster than a loop over the colours
+            witnesses[b, k] = half_bits(half_value(witnesses[b, k]) + pixels[p, WITNESS])
+            added = w * paint[p, 3]
+            total = half_value(colour[b, k, 3]) + added
+            share = added / total
+            colour[b, k, 0] = blended(colour[b, k, 0], gain[0] * paint[p, 0], share)
+            colour[b, k, 1] = blended(colour[b, k, 1], gain[1] * paint[p, 1], share)
+            colour[b, k, 2] = blended(colour[b, k, 2], gain[2] * paint[p, 2], share)
+            colour[b, k, 3] = half_bits(min(total, HALF_MAX))
 
 
 @compiled

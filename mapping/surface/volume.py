@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,17 +22,9 @@ from bmask_slam.mapping.surface.blocks import (
     open_tables,
     voxel_places,
 )
-from bmask_slam.mapping.surface.depth_frame import (
-    BEHIND,
-    NX,
-    NZ,
-    OFFSET,
-    WEIGHT,
-    DepthFrame,
-    Z,
-    gains,
-)
-from bmask_slam.mapping.surface.kernel import HALVES, NEAREST_M, add_frame
+from bmask_slam.mapping.surface.depth_frame import DepthFrame, gains
+from bmask_slam.mapping.surface.kernel import NEAREST_M, add_frame
+from bmask_slam.mapping.surface.pixel_planes import BEHIND, NX, NZ, OFFSET, WEIGHT, Z
 
 FRONT_VOXELS = 8
 """Distances in front of a surface are cut off at so many voxels."""
@@ -121,14 +112,14 @@ class SurfaceVolume:
         Raises:
             InputError: the disk is full.
         """
-        frame = self._as_seen_before(frame)
+        gain = self._gain(frame)
         if only is None:
             self._make_blocks(frame)
         T_camera_world = torch.from_numpy(inverse(frame.T_world_camera)).to(torch.float32)
         bricks = self._seen(frame, T_camera_world)
         if only is not None:
             bricks = bricks[only.index_select(0, bricks // BRICKS)]
-        self._update(bricks, frame, T_camera_world)
+        self._update(bricks, frame, gain, T_camera_world)
         self._frames += 1
         if self._frames % RELEASE_FRAMES == 0:
             self.release()
@@ -173,14 +164,13 @@ class SurfaceVolume:
         rays = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], -1)
         return v * camera.width + u, torch.nn.functional.pad(rays, (0, 1), value=1)
 
-    def _as_seen_before(self, frame: DepthFrame) -> DepthFrame:
-        """The frame in the exposure of the surface."""
+    def _gain(self, frame: DepthFrame) -> Tensor:
+        """Factors (3,) of red, green and blue that give a frame the exposure of the surface."""
         step = max(int(np.sqrt(len(frame.pixels) / SAMPLES)), 1)
         pixel, rays = self._rays(frame, step)
         T = torch.from_numpy(frame.T_world_camera).to(torch.float32)
         points = rays * frame.pixels[pixel, Z, None] @ T[:3, :3].T + T[:3, 3]
-        gain = gains(frame.paint[pixel, :3], self.colours_at(points))
-        return replace(frame, paint=frame.paint * torch.nn.functional.pad(gain, (0, 1), value=1))
+        return gains(frame.paint[pixel, :3], self.colours_at(points))
 
     def colours_at(self, points_world: Tensor) -> Tensor:
         """Colours (N, 3) of the voxels at points (N, 3), and their weights: (N, 4)."""
@@ -232,19 +222,22 @@ class SurfaceVolume:
         u, v = u.round_().clamp_(0, camera.width - 1), v.round_().clamp_(0, camera.height - 1)
         return v.mul_(camera.width).add_(u).to(torch.int64), inside
 
-    def _update(self, bricks: Tensor, frame: DepthFrame, T_camera_world: Tensor) -> None:
-        """Add what the frame tells about the voxels of bricks (N,)."""
+    def _update(
+        self, bricks: Tensor, frame: DepthFrame, gain: Tensor, T_camera_world: Tensor
+    ) -> None:
+        """Add what the frame, its colours times a gain (3,), tells of the voxels of bricks (N,)."""
         R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
         corners = (self._origin[bricks // BRICKS] + self._bricks[bricks % BRICKS]) @ R.T + t
         camera, voxel_m = self._camera, self.voxel_m
         intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
         reach = (voxel_m, FRONT_VOXELS * voxel_m, COLOUR_VOXELS * voxel_m, 1 - FREE_SHARE)
         bits = (t.numpy().view(np.uint16) for t in (self.witnesses, self.free, self.colour))
+        images = (t.numpy() for t in (frame.pixels, frame.free_m, frame.paint))
         add_frame(
             bricks.numpy(),
             (corners.numpy(), (self._voxels @ R.T).numpy()),
             (*map(np.float32, intrinsics), camera.width, camera.height),
-            (frame.pixels.numpy(), frame.free_m.numpy(), frame.paint.numpy()),
+            (*images, tuple(map(np.float32, gain.tolist()))),
             tuple(map(np.float32, reach)),
-            (self.distance.numpy(), self.weight.numpy(), *bits, HALVES),
+            (self.distance.numpy(), self.weight.numpy(), *bits),
         )

@@ -16,7 +16,7 @@ from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe, DenseMapper, FusedKeyframe
 from bmask_slam.mapping.inverse_depth.depth_map import from_sensor
-from bmask_slam.mapping.products.submaps import Submap, make_submap
+from bmask_slam.mapping.products.submaps import make_submap
 from bmask_slam.mapping.products.surface_labels import InstanceEvidence, dilate, keyframe_labels
 from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.semantics.instances.instances import Instance
@@ -32,7 +32,7 @@ class FusionCounts:
         fused: number of keyframes that were fused.
         reused: number of keyframes that were finished before.
         skipped: keyframes that could not be used, by id, with the reason.
-        fuse_ms: time of Steps 1 to 6 for each fused keyframe, without reading and writing files.
+        fuse_ms: time of Steps 1 to 5 for each fused keyframe, without reading and writing files.
     """
 
     fused: int = 0
@@ -57,7 +57,7 @@ class KeyframeInstances:
 
 
 class KeyframeFusion:
-    """Fuses keyframes and saves the submap of each when its neighbours have come.
+    """Fuses keyframes and saves each when its neighbours have come.
 
     Attributes:
         counts: what happened to the keyframes.
@@ -105,8 +105,8 @@ class KeyframeFusion:
         segment: int,
         instances: KeyframeInstances,
         poses: Mapping[int, Array],
-    ) -> list[Submap]:
-        """Add a keyframe; the submaps that this completes are saved and returned.
+    ) -> list[FusedKeyframe]:
+        """Add a keyframe; those that this completes are saved and returned.
 
         Keyframes of different map segments have no frame in common and are not fused.
         ``poses`` are the current T_world_camera (4, 4) of keyframes by id.
@@ -150,13 +150,13 @@ class KeyframeFusion:
             self._mapper.relabel(keyframe_id, numbers, hidden)
 
     def remove(self, keyframe_ids: Collection[int]) -> None:
-        """Remove keyframes that left the map, with their submaps."""
+        """Remove keyframes that left the map, with what was saved of them."""
         self._mapper.remove(keyframe_ids)
         for number in keyframe_ids:
             self._evidence.pop(number, None)
             self._folder.remove(number)
 
-    def finish(self) -> list[Submap]:
+    def finish(self) -> list[FusedKeyframe]:
         """Fuse and save the keyframes that still wait. Raises InputError if the disk is full."""
         started_s = time.perf_counter()
         return self._save(self._mapper.flush(), started_s)
@@ -168,12 +168,10 @@ class KeyframeFusion:
         points = FusedKeyframe(keyframe, measured, excluded.astype(np.uint8))
         self._folder.write_excluded(make_submap(points, self._camera, self._options.voxel_m))
 
-    def _save(self, finished: Sequence[FusedKeyframe], started_s: float) -> list[Submap]:
-        voxel_m, folder = self._options.voxel_m, self._folder
-        submaps = [make_submap(r, self._camera, voxel_m) for r in finished]
+    def _save(self, finished: list[FusedKeyframe], started_s: float) -> list[FusedKeyframe]:
         elapsed_ms = 1e3 * (time.perf_counter() - started_s)
-        for result, submap in zip(finished, submaps, strict=True):
-            folder.write(result, self._evidence.pop(submap.anchor))
+        for result in finished:
+            self._folder.write(result, self._evidence.pop(result.keyframe.id))
             self.counts.fused += 1
             self.counts.fuse_ms.append(elapsed_ms / len(finished))
-        return submaps
+        return finished

@@ -22,8 +22,9 @@ from bmask_slam.graph.arrays import Array, Floats
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import transform
+from bmask_slam.mapping.inverse_depth.dense_mapper import FusedKeyframe
 from bmask_slam.mapping.inverse_depth.depth_map import MeasurementConfig
-from bmask_slam.mapping.surface.depth_frame import DepthFrame
+from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame
 from bmask_slam.mapping.surface.extraction import (
     MIN_WITNESSES,
     Surface,
@@ -49,6 +50,8 @@ which is so far ahead of the camera."""
 POINT_STEP_PX, CACHED = 4, 40
 """Every fourth pixel of a keyframe is a point of the judge; so many keyframes' are kept."""
 PATIENCE = 30
+FRESH = 4
+"""So many keyframes that were just fused are kept, to be integrated without reading them."""
 PART_VOXELS, PARTS_AT_ONCE = 2, 3
 """Parts for a viewer have one vertex in a cell of two voxels; and how many are made at once."""
 
@@ -84,6 +87,7 @@ class GrowingSurface:
         self._poses: dict[int, Array] = {}
         self._judges: dict[int, list[int]] = {}
         self._points: OrderedDict[int, Floats] = OrderedDict()
+        self._fresh: OrderedDict[int, FusedKeyframe] = OrderedDict()
         volume = SurfaceVolume(options.surface_voxel_m, camera, folder=folder.path)
         self._surface = FollowingSurface(volume, self._load)
         self._following: Iterator[tuple[int, bool]] | None = None
@@ -105,9 +109,17 @@ class GrowingSurface:
         """
         self._poses, self._is_checked = dict(poses), False
 
+    def add(self, result: FusedKeyframe) -> None:
+        """A keyframe is fused, and in the folder."""
+        self.fused.add(result.keyframe.id)
+        self._fresh[result.keyframe.id] = result
+        if len(self._fresh) > FRESH:
+            self._fresh.popitem(last=False)
+
     def mask(self, keyframe_id: int) -> None:
         """Some of a keyframe's pixels were cut out: what was judged by it is integrated again."""
         self._points.pop(keyframe_id, None)
+        self._fresh.pop(keyframe_id, None)
         judged = [n for n, by in self._judges.items() if keyframe_id in by]
         self._changed |= {-1 - keyframe_id, *judged} & set(self._surface)
         self._is_checked = False
@@ -192,9 +204,14 @@ class GrowingSurface:
     def _load(self, number: int, T_world_camera: Array) -> DepthFrame | None:
         """A keyframe or frame at a pose; None if it is not there any more or broken."""
         camera, options = self._camera, self._options
+        if not self._is_known(number):
+            return None  # removed while poses were followed
         try:
             if number < 0:
-                voxel_m = options.surface_voxel_m
+                voxel_m, fresh = options.surface_voxel_m, self._fresh.pop(-1 - number, None)
+                if fresh is not None:
+                    rgb = fresh.keyframe.rgb
+                    return depth_frame(fresh.map.cpu(), rgb, T_world_camera, camera, voxel_m)
                 return keyframe_as_frame(self._folder, -1 - number, T_world_camera, camera, voxel_m)
             images = self.frames.load(number)
             self._judges[number] = near = self._near(T_world_camera)

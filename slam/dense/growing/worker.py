@@ -18,6 +18,7 @@ from bmask_slam.dense.products import GrownSurface
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.mapping.inverse_depth.dense_mapper import FusedKeyframe
 from bmask_slam.mapping.surface.extraction import NOTHING
 
 logger = logging.getLogger(__name__)
@@ -73,10 +74,10 @@ class SurfaceWorker:
         if self._surface is not None:
             self._surface.reopen()
 
-    def add_keyframe(self, keyframe_id: int) -> None:
-        """A keyframe is fused."""
+    def add_keyframe(self, result: FusedKeyframe) -> None:
+        """A keyframe is fused and saved."""
         if self._surface is not None:
-            self._surface.fused.add(keyframe_id)
+            self._surface.add(result)
 
     def mask(self, keyframe_id: int) -> None:
         """More of a fused keyframe was cut out."""

@@ -44,7 +44,7 @@ from bmask_slam.live.processes.dense_messages import (
     ShowSurface,
 )
 from bmask_slam.mapping.inverse_depth.dense_mapper import FusedKeyframe
-from bmask_slam.mapping.products.submaps import Submap
+from bmask_slam.mapping.products.submaps import make_submap
 from bmask_slam.mapping.products.surface_labels import InstanceEvidence
 from bmask_slam.run_folder.folder import DISK_ERRORS
 from bmask_slam.semantics.labels import LabelSet
@@ -206,18 +206,20 @@ class DenseServer:
         counts.skipped = {number: reasons.get(number, "") for number in missing}
         return counts
 
-    def _report(self, submaps: list[Submap]) -> None:
-        """Send which submaps are saved, with a preview for the viewer."""
-        for submap in submaps:
-            reason = self._folder.unwritten.get(submap.anchor)
+    def _report(self, finished: list[FusedKeyframe]) -> None:
+        """Send which keyframes are saved, with a preview for the viewer."""
+        for result in finished:
+            number = result.keyframe.id
+            reason = self._folder.unwritten.get(number)
             if reason is None:
-                self.growing.add_keyframe(submap.anchor)
-                self._send(Mapped(submap.anchor, self._preview(submap)))
+                self.growing.add_keyframe(result)
+                self._send(Mapped(number, self._preview(result)))
             else:
-                self._send(NotMapped(submap.anchor, reason, disk_full=True))
+                self._send(NotMapped(number, reason, disk_full=True))
 
-    def _preview(self, submap: Submap) -> Preview | None:
+    def _preview(self, result: FusedKeyframe) -> Preview | None:
         if not self._setup.shown:
             return None
+        submap = make_submap(result, self._setup.camera, self._options.voxel_m)
         step = -(-len(submap) // self._setup.shown) or 1
         return Preview(submap.points[::step].copy(), submap.colours[::step].copy())

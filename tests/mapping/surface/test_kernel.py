@@ -9,17 +9,11 @@ from surface_scene import CAMERA, as_map, plane_rho, poses
 
 from bmask_slam.graph.arrays import Floats
 from bmask_slam.graph.geometry import inverse
+from bmask_slam.mapping import compiled
 from bmask_slam.mapping.surface import kernel
 from bmask_slam.mapping.surface.blocks import BRICKS
-from bmask_slam.mapping.surface.depth_frame import (
-    BEHIND,
-    NZ,
-    OFFSET,
-    WEIGHT,
-    DepthFrame,
-    Z,
-    depth_frame,
-)
+from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame
+from bmask_slam.mapping.surface.pixel_planes import BEHIND, NZ, OFFSET, WEIGHT, Z
 from bmask_slam.mapping.surface.volume import (
     COLOUR_VOXELS,
     FREE_SHARE,
@@ -35,9 +29,12 @@ def test_halves_are_those_of_numpy() -> None:
     values = np.concatenate(
         [rng.uniform(0, 300, 2000), 10.0 ** rng.uniform(-9, np.log10(kernel.HALF_MAX), 2000), [0]]
     ).astype(np.float32)
-    ties = (kernel.HALVES[:31000:7] + kernel.HALVES[1:31001:7]) / 2
-    for value in np.concatenate([values, kernel.HALVES[:31000:5], ties]):
+    bits = np.arange(31001, dtype=np.uint16)
+    halves = bits.view(np.float16).astype(np.float32)
+    ties = (halves[:-1:7] + halves[1::7]) / 2
+    for value in np.concatenate([values, halves[::5], ties]):
         assert kernel.half_bits(value) == value.astype(np.float16).view(np.uint16), value
+    assert [kernel.half_value(b) for b in bits] == halves.tolist()
 
 
 def frames() -> list[DepthFrame]:
@@ -104,5 +101,5 @@ def test_where_nothing_can_be_kept_it_is_compiled_anew(monkeypatch: pytest.Monke
             raise RuntimeError("no locator available")
         return lambda function: function
 
-    monkeypatch.setattr(kernel.numba, "njit", refused)
-    assert kernel.compiled(len) is len
+    monkeypatch.setattr(compiled.numba, "njit", refused)
+    assert compiled.compiled(len) is len

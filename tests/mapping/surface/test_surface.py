@@ -16,16 +16,10 @@ from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, transform
 from bmask_slam.mapping.open3d_loader import load_open3d
 from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.mesh_files import write_glb, write_mesh
-from bmask_slam.mapping.surface.depth_frame import (
-    NX,
-    RIM,
-    WEIGHT,
-    DepthFrame,
-    depth_frame,
-    mark_unexplained,
-)
+from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame, mark_unexplained
 from bmask_slam.mapping.surface.extraction import MIN_WITNESSES, Surface, extract, without_crumbs
 from bmask_slam.mapping.surface.gate import KeyframeSurface, judge_of
+from bmask_slam.mapping.surface.pixel_planes import NX, RIM, WEIGHT
 from bmask_slam.mapping.surface.volume import SurfaceVolume
 
 NORMAL, OFFSET_M, VOXEL_M, SIGMA = np.array([0.2, -0.1, 1.0]), 2.0, 0.05, 0.002

@@ -1,0 +1,15 @@
+"""Loops over pixels and voxels, compiled by numba."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numba
+
+
+def compiled(function: Callable) -> Callable:
+    """The function compiled when it is first called; kept on disk where there is a place for it."""
+    try:
+        return numba.njit(cache=True, nogil=True)(function)
+    except RuntimeError:  # neither beside the source nor in the user's cache
+        return numba.njit(nogil=True)(function)
