@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Floats, Ints, Mask
+from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
+from bmask_slam.mapping.compiled import compiled
 from bmask_slam.semantics.beliefs.surface_geometry import Ground, log_likelihoods, with_evidence
 from bmask_slam.semantics.beliefs.surface_store import MIN_PROBABILITY, log_view, pooled
 from bmask_slam.semantics.instances.surfaces import SurfaceClasses
@@ -42,13 +43,41 @@ def find_regions(seen: SurfaceClasses | None, free: Mask) -> Regions:
     numbers = np.zeros(free.shape, np.uint16)
     if seen is None:
         return Regions(numbers, np.zeros((0, 0), np.float32))
-    p = seen.pixels()[free]
-    grade = np.searchsorted(SURE, p.max(axis=1))
-    keys = p.argmax(axis=1) * (len(SURE) + 1) + grade
-    _, region, count = np.unique(keys, return_inverse=True, return_counts=True)
-    numbers[free] = region + 1
-    mean = np.stack([np.bincount(region, column) for column in p.T], axis=1) / count[:, None]
+    p, grades = np.ascontiguousarray(seen.pixels()), len(SURE) + 1
+    keys = np.empty(free.shape, np.int64)
+    sums, counts = np.zeros((p.shape[2] * grades, p.shape[2])), np.zeros(p.shape[2] * grades)
+    sum_alike(p, free, np.array(SURE, np.float32), (keys, sums, counts))
+    used = counts > 0
+    numbers[free] = np.cumsum(used)[keys[free]]
+    mean = sums[used] / counts[used, None]
     return Regions(numbers, log_view(mean.astype(np.float32)), seen.labels.names[1:])
+
+
+@compiled
+def sum_alike(p: Floats, free: Mask, sure: Floats, made: tuple[Ints, Array, Array]) -> None:
+    """Add up the class distributions p (H, W, C) of free pixels of one class and grade.
+
+    A grade is how many of the probabilities ``sure`` (S,) that of the likeliest class exceeds.
+    Filled in: the key (H, W) of each free pixel, class (S + 1) + grade, and the sum (K, C) and
+    number (K,) of the pixels of each key.
+    """
+    keys, sums, counts = made
+    height, width, classes = p.shape
+    for v in range(height):
+        for u in range(width):
+            if not free[v, u]:
+                continue
+            best = 0
+            for c in range(1, classes):
+                if p[v, u, c] > p[v, u, best]:
+                    best = c
+            key = best * (len(sure) + 1)
+            for limit in sure:
+                key += p[v, u, best] > limit
+            keys[v, u] = key
+            counts[key] += 1
+            for c in range(classes):
+                sums[key, c] += p[v, u, c]
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,8 +76,8 @@ def depth_frame(
     clear = _least_around(inner_m, PAINT_PX) > 0
     paint_of_pixels(rgb.reshape(-1, 3), clear.reshape(-1), sight.reshape(-1), paint)
     free_m = _least_around(known_m, SILHOUETTE_PX).reshape(-1)
-    made = (pixels.reshape(-1, 8), free_m, paint)
-    return DepthFrame(*map(torch.from_numpy, made), T_world_camera)
+    planes, free, colours = map(torch.from_numpy, (pixels.reshape(-1, 8), free_m, paint))
+    return DepthFrame(planes, free, colours, T_world_camera)
 
 
 def _least_around(values: Floats, radius: int) -> Floats:

@@ -10,7 +10,7 @@ from bmask_slam.mapping.surface.pixel_planes import BEHIND, NX, NY, NZ, OFFSET, 
 
 HALF_MAX = np.float32(6e4)
 """Weights of colours are cut off here, below the largest float16."""
-NEAREST_M = np.float32(0.1)
+NEAREST_M = 0.1
 Places = tuple[Floats, Floats]
 """(N, 3) the first voxels of bricks in the camera, and (V, 3) a brick's voxels from there, m."""
 View = tuple[float, float, float, float, int, int]

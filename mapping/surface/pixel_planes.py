@@ -25,7 +25,13 @@ PER_CM2 = np.float32(1e-4)
 ONE = np.float32(1)
 View = tuple[float, float, float, float]
 """fx, fy, cx, cy in pixels."""
-Point = tuple[float, float, float]
+Depth = tuple[Floats, Floats, Floats]
+"""Inverse depth and its variance (H, W), and normals (H, W, 3), which may be NaN."""
+Planes = tuple[Floats, Floats, Floats, Floats]
+"""What is filled in: the pixels (H, W, 8); z (H, W) in metres, 0 where it is unknown; z without
+rims and pixels that tell nothing, 0 there; and the weight (H, W) of the view's colour."""
+Real = float | np.float32
+Point = tuple[Real, Real, Real]
 
 
 @compiled
@@ -55,19 +61,10 @@ def plane_beside(
 
 
 @compiled
-def planes_of_pixels(
-    depth: tuple[Floats, Floats, Floats],
-    view: View,
-    behind_m: tuple[float, float, float],
-    made: tuple[Floats, Floats, Floats, Floats],
-) -> None:
+def planes_of_pixels(depth: Depth, view: View, behind_m: Point, made: Planes) -> None:
     """What the pixels of an image tell about the distance to the surface, see ``DepthFrame``.
 
-    Args:
-        depth: inverse depth, its variance (H, W), and normals (H, W, 3), which may be NaN.
-        behind_m: least and largest distance behind the surface that counts, and that of rims.
-        made: what is filled: pixels (H, W, 8); z (H, W) in metres, 0 where unknown; z without rims
-            and pixels that tell nothing, 0 there; and the weight (H, W) of the view's colour.
+    ``behind_m`` are the least and largest distance behind the surface that count, and that of rims.
     """
     rho, variance, normals = depth
     pixels, known_m, inner_m, sight = made

@@ -15,7 +15,7 @@ import numpy as np
 from bmask_slam.datasets.weights import find_weights
 from bmask_slam.dense.folder import FRAMES, DenseFolder, folder_settings
 from bmask_slam.dense.keyframe_fusion import FusionCounts, KeyframeFusion
-from bmask_slam.dense.keyframe_input import image_name, load_keyframe
+from bmask_slam.dense.keyframe_input import KeyframeSnapshot, image_name, load_keyframe
 from bmask_slam.dense.options import MapOptions, resolve_options
 from bmask_slam.dense.products import Products, write_products
 from bmask_slam.dense.saved_map import MappedRun, open_run, with_right_images
@@ -25,13 +25,15 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.growing_table import lock_file
 from bmask_slam.graph.whole_file import remove
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
-from bmask_slam.mapping.inverse_depth.dense_mapper import WINDOW
+from bmask_slam.mapping.inverse_depth.dense_mapper import WINDOW, DenseKeyframe
 from bmask_slam.run_folder.frame_file import FRAMES as FRAME_TABLE
 from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.runtime.memory import give_back_memory
+from bmask_slam.runtime.prefetch import prepared_ahead
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
+from bmask_slam.semantics.torch_threads import one_thread
 from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.tracking.results import FrameResult
 from bmask_slam.world.keyframe import Keyframe
@@ -40,6 +42,8 @@ from bmask_slam.world.world_map import WorldMap
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int], None]
+_Read = tuple[DenseKeyframe, KeyframeSnapshot, list[Instance]]
+"""A keyframe's images, undistorted and as they were, and the instances in them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,32 +125,43 @@ class RunFusion:
         Raises:
             InputError: the disk is full.
         """
+        self._fuse(keyframe, self._read(keyframe))
+
+    def _read(self, keyframe: Keyframe) -> _Read | InputError:
+        """Its images and instances, or why it cannot be used."""
         try:
             dense, snapshot = load_keyframe(self.run, keyframe, self.options.source)
             name = image_name(self.run, keyframe)
-            instances = self.segmenter.segment(snapshot.frame.rgb, name)
+            return dense, snapshot, self.segmenter.segment(snapshot.frame.rgb, name)
         except InputError as error:
-            logger.warning("%s; skipped", error)
-            self._fusion.counts.skipped[keyframe.id] = str(error)
+            return error
+
+    def _fuse(self, keyframe: Keyframe, read: _Read | InputError) -> None:
+        if isinstance(read, InputError):
+            logger.warning("%s; skipped", read)
+            self._fusion.counts.skipped[keyframe.id] = str(read)
             return
+        dense, snapshot, instances = read
         labelled = self._fusion.label_pixels(instances, snapshot.landmark_ids, snapshot.pixels)
         self._fusion.add(dense, snapshot.segment, labelled, self.run.poses())
 
     def fuse_all(self, progress: Progress = lambda done, total: None) -> FusionCounts:
-        """Fuse every keyframe that is not finished and save its submap.
+        """Fuse every keyframe that is not finished and save it.
+
+        A second thread reads keyframes ahead and finds their instances.
 
         Raises:
             InputError: no keyframe can be used, or the disk is full.
         """
-        keyframes, counts = self.run.keyframes, self._fusion.counts
-        needed = self._needed()
-        for k, keyframe in enumerate(keyframes):
-            if needed[k]:
-                self.add(keyframe)
-            else:
-                counts.reused += 1
-            progress(k + 1, len(keyframes))
-        self._fusion.finish()
+        keyframes, counts, needed = self.run.keyframes, self._fusion.counts, self._needed()
+        before = int((~needed).sum())
+        counts.reused += before
+        chosen = [k for k, wanted in zip(keyframes, needed, strict=True) if wanted]
+        with one_thread():
+            for done, (keyframe, read) in enumerate(prepared_ahead(self._read, chosen), 1):
+                self._fuse(keyframe, read)
+                progress(before + done, len(keyframes))
+            self._fusion.finish()
         if not counts.fused + counts.reused:
             reason = next(iter(counts.skipped.values()), "it has none")
             raise InputError(f"{self.run.path}: no keyframe can be mapped; the first: {reason}")

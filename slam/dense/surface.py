@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,6 +34,7 @@ from bmask_slam.mapping.surface.following import FollowingSurface, read_kept
 from bmask_slam.mapping.surface.gate import DepthView, KeyframeSurface, judge_of
 from bmask_slam.mapping.surface.volume import SurfaceVolume
 from bmask_slam.run_folder.frame_file import FRAMES, read_frames
+from bmask_slam.runtime.prefetch import prepared_ahead
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.torch_threads import one_thread
 from bmask_slam.sequences.frame import Frame
@@ -50,8 +49,6 @@ VOLUME, INDEX = "volume", "index"
 """The folder of a volume that is kept, and its file of what is in it."""
 BESIDE_PX = 20
 """Depth so near to a mask that was cut out may be of the same person."""
-AHEAD = 3
-"""Frames that are prepared while another is integrated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +126,8 @@ class _SurfaceMaker:
         new = {n: T for n, T in frames.items() if n not in surface}
         handled = len(poses) - len(new)
         progress(handled, len(poses))
-        for done, (number, frame) in enumerate(self._prepared(new), handled + 1):
+        prepared = prepared_ahead(lambda number: self._frame(number, new[number]), new)
+        for done, (number, frame) in enumerate(prepared, handled + 1):
             if frame is not None:
                 surface.add(number, frame)
             progress(done, len(poses))
@@ -170,17 +168,6 @@ class _SurfaceMaker:
         fused = self._fused
         camera, voxel_m = fused.run.camera, fused.options.surface_voxel_m
         return keyframe_as_frame(fused.folder, -1 - number, T_world_camera, camera, voxel_m)
-
-    def _prepared(self, frames: dict[int, Array]) -> Iterator[tuple[int, DepthFrame | None]]:
-        """The frames in order, some prepared ahead by a second thread."""
-        with ThreadPoolExecutor(1) as thread:
-            waiting: deque[tuple[int, Future[DepthFrame | None]]] = deque()
-            for number, T in frames.items():
-                waiting.append((number, thread.submit(self._frame, number, T)))
-                if len(waiting) > AHEAD:
-                    done, frame = waiting.popleft()
-                    yield done, frame.result()
-            yield from ((number, frame.result()) for number, frame in waiting)
 
     def _frame(self, index: int, T_world_camera: Array) -> DepthFrame | None:
         """A frame after Step 3 and the gate; None if its images cannot be read."""

@@ -7,7 +7,7 @@ import pytest
 from scipy.sparse import csr_matrix
 
 from bmask_slam.mapping.products.surface_labels import InstanceEvidence, LabelTable, keyframe_labels
-from bmask_slam.mapping.products.surface_regions import StuffFusion, find_regions
+from bmask_slam.mapping.products.surface_regions import SURE, StuffFusion, find_regions
 from bmask_slam.semantics.beliefs.label_store import LabelStoreConfig
 from bmask_slam.semantics.beliefs.surface_geometry import Ground
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
@@ -35,6 +35,20 @@ def test_regions_are_where_no_instance_is() -> None:
     assert np.exp(found.log_p[wall - 1]) == pytest.approx([0.8, 0.1, 0.1], abs=0.02)
     assert np.exp(found.log_p[floor - 1]) == pytest.approx([0.2, 0.6, 0.2], abs=0.02)
     assert not find_regions(None, free).numbers.any()
+
+
+def test_regions_are_those_of_plain_numpy() -> None:
+    rng = np.random.default_rng(4)
+    p = rng.dirichlet([0.3] * 3, (8, 8)).astype(np.float32)
+    classes, free = SurfaceClasses(STUFF, p, 8.0, (64, 60)), rng.random((64, 60)) > 0.2
+    found, pixels = find_regions(classes, free), classes.pixels()
+    grades = (pixels.max(axis=2)[..., None] > SURE).sum(axis=2)
+    keys = pixels.argmax(axis=2) * (len(SURE) + 1) + grades
+    known = np.unique(keys[free])
+    assert np.array_equal(found.numbers, np.where(free, np.searchsorted(known, keys) + 1, 0))
+    means = np.array([pixels[free & (keys == key)].mean(axis=0) for key in known])
+    np.testing.assert_allclose(np.exp(found.log_p), means, atol=1e-3)
+    assert len(known) > 6
 
 
 def test_names_that_both_have_are_one_class() -> None:
