@@ -29,6 +29,9 @@ LIKELIHOOD_FRAMES = 600
 """Longest stretch, in the middle, from which the noise is found."""
 EVALUATIONS = 150
 ITERATIONS = 2
+LEAST_KNOWN = 1e-9
+"""A frame that says so little of a direction, as a share of what it says of another, is unknown:
+rounding makes its covariance indefinite."""
 STRETCH, OVERLAP = 3000, 100
 """Frames that are smoothed at once, and further ones on each side, so that memory is bounded."""
 
@@ -70,16 +73,16 @@ def smooth(measured: Trajectory, information: Array) -> Trajectory:
 
     Args:
         measured: N poses T_world_camera, with increasing stamps.
-        information: (N, 6, 6) inverse covariances of these, ``[rad, m]`` on the right side; NaN
-            where unknown, which counts as the median of the others.
+        information: (N, 6, 6) inverse covariances of these, ``[rad, m]`` on the right side; NaN or
+            singular where unknown, which counts as the median of the others.
 
     Returns:
         As many poses; those of fewer than ``MIN_FRAMES`` frames, or of frames without information,
         are returned unchanged.
     """
     finite = np.isfinite(information).all(axis=(1, 2), keepdims=True)
-    least = np.linalg.eigvalsh(np.where(finite, information, 0.0))[:, 0]
-    known = np.flatnonzero(least > 0)
+    sizes = np.linalg.eigvalsh(np.where(finite, information, 0.0))
+    known = np.flatnonzero(sizes[:, 0] > LEAST_KNOWN * sizes[:, -1])
     if len(measured) < MIN_FRAMES or not len(known):
         return measured
     found = np.linalg.inv(information[known])

@@ -157,3 +157,17 @@ def test_frames_of_unknown_accuracy(unknown: float) -> None:
     assert smooth(raw, np.full_like(stated, unknown)) is raw
     short = Trajectory(raw.timestamps_s[: MIN_FRAMES - 1], raw.poses_world_camera[: MIN_FRAMES - 1])
     assert smooth(short, stated[: MIN_FRAMES - 1]) is short
+
+
+def test_a_frame_that_rounding_makes_indefinite_is_unknown_and_the_others_are_smoothed() -> None:
+    truth, turned = walk(120), np.linalg.qr(np.random.default_rng(0).normal(size=(6, 6)))[0]
+    sigmas = np.tile([2e-3, 2e-3, 2e-3, 5e-3, 5e-3, 5e-3], (120, 1))
+    raw, given = measured(truth, sigmas), information(sigmas)
+    given[60] = turned @ np.diag([1e-6, 1e5, 1e6, 1e7, 1e8, 1e9]) @ turned.T
+    assert np.linalg.eigvalsh(given[60])[0] > 0
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(np.linalg.inv(MotionNoise().covariances(np.linalg.inv(given[60]))))
+    found = smooth(raw, given)
+    assert (errors(found, truth) < 0.6 * errors(raw, truth)).all()
+    given[60] = np.nan
+    np.testing.assert_array_equal(found.poses_world_camera, smooth(raw, given).poses_world_camera)
