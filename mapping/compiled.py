@@ -8,8 +8,11 @@ import numba
 
 
 def compiled(function: Callable) -> Callable:
-    """The function compiled when it is first called; kept on disk where there is a place for it."""
+    """The function compiled when it is first called; kept on disk where there is a place for it.
+
+    It divides as numpy does: by 0 to inf or NaN.
+    """
     try:
-        return numba.njit(cache=True, nogil=True)(function)
+        return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     except RuntimeError:  # neither beside the source nor in the user's cache
-        return numba.njit(nogil=True)(function)
+        return numba.njit(nogil=True, error_model="numpy")(function)

@@ -96,7 +96,7 @@ def test_a_volume_holds_what_the_rules_give(order: tuple[int, ...]) -> None:
 
 
 def test_where_nothing_can_be_kept_it_is_compiled_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(*, cache: bool = False, nogil: bool) -> object:
+    def refused(*, cache: bool = False, nogil: bool, error_model: str) -> object:
         if cache:
             raise RuntimeError("no locator available")
         return lambda function: function

@@ -29,6 +29,7 @@ def test_planes_are_those_of_plain_numpy() -> None:
     rho = plane_rho(T, np.array([0.2, -0.1, 1.0]), 2.0)
     rho[8:20, 10:22] = plane_rho(T, np.array([0.1, 0.3, 1.0]), 1.2)[8:20, 10:22]  # a thing in front
     rho[rng.random(rho.shape) < 0.03] = np.nan
+    rho[15, 30] = 0.0  # infinitely far
     measured = as_map(rho, SIGMA)
     rgb = rng.integers(20, 230, (*rho.shape, 3), np.uint8)
     pixels = depth_frame(measured, rgb, T, CAMERA, VOXEL_M).pixels.numpy().reshape(*rho.shape, 8)
