@@ -2,7 +2,7 @@
 
     python -m benchmarks.scale.building [--work runs/bench/building] [--fps 30] [--width 640]
 
-The building is rendered once (20 000 frames of 640x480 take hours and 16 GB of disk; fewer and
+The building is rendered once (20 000 frames of 640x480 take an hour and 15 GB of disk; fewer and
 smaller ones are a thinner version of the same walk) and run with `--segmenter none`, loops closed
 and not. A closed loop is wrong if its measurement is further than ``WRONG_M`` from the truth; rooms
 that look alike are 3.2 m and more apart. Times are of this machine; what counts is that they stay.

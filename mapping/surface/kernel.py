@@ -6,7 +6,17 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Floats, Ints
 from bmask_slam.mapping.compiled import compiled
-from bmask_slam.mapping.surface.pixel_planes import BEHIND, NX, NY, NZ, OFFSET, WEIGHT, WITNESS, Z
+from bmask_slam.mapping.surface.pixel_planes import (
+    BEHIND,
+    NX,
+    NY,
+    NZ,
+    OFFSET,
+    ONE,
+    WEIGHT,
+    WITNESS,
+    Z,
+)
 
 HALF_MAX = np.float32(6e4)
 """Weights of colours are cut off here, below the largest float16."""
@@ -24,7 +34,6 @@ metres, and the share of a ray's free depth that is kept."""
 Tables = tuple[Floats, Floats, Array, Array, Array]
 """Distance and weight (B, V) as float32, witnesses, free (B, V) and colour (B, V, 4) as the bits of
 float16, of all bricks."""
-ONE = np.float32(1)
 _LEAST_NORMAL, _EXPONENTS = np.uint32(0x38800000), np.uint32(0x38000000)
 """The least float32 that is a normal float16, and what the exponents of the two differ by, bits."""
 _NORMAL, _SHIFT, _ROUND, _LAST = 0x400, np.uint32(13), np.uint32(0xFFF), np.uint32(1)

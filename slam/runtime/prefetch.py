@@ -14,7 +14,7 @@ AHEAD = 3
 
 
 def prepared_ahead(
-    prepare: Callable[[Item], Result], items: Iterable[Item], ahead: int = AHEAD
+    prepare: Callable[[Item], Result], items: Iterable[Item]
 ) -> Iterator[tuple[Item, Result]]:
     """Each item with what ``prepare`` makes of it in a second thread, in order.
 
@@ -25,7 +25,7 @@ def prepared_ahead(
         try:
             for item in items:
                 waiting.append((item, thread.submit(prepare, item)))
-                if len(waiting) > ahead:
+                if len(waiting) > AHEAD:
                     done, result = waiting.popleft()
                     yield done, result.result()
             while waiting:

@@ -133,6 +133,7 @@ class GrowingSurface:
         self.fused -= set(keyframe_ids)
         for number in keyframe_ids:
             self._points.pop(number, None)
+            self._fresh.pop(number, None)
         self._is_checked = False
 
     def due(self, ended: bool = False) -> list[int]:
