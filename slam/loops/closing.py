@@ -268,11 +268,11 @@ class LoopCloser:
         def chi2_with(S: Array) -> float:
             return float(mahalanobis(implied[None], S[None])[0])
 
-        gate, here = self.config.gate, world.keyframes[loop.keyframe_b].T_world_camera[None]
-        if chi2_with(own + self.drift.covariance(here)) < gate:
+        gate = self.config.gate
+        if chi2_with(own + self.drift.floor) < gate:
             return True
         way = paths.way(*loop.ends)
-        if not len(way):
+        if not len(way.poses):
             return True
         S = own + self.drift.covariance(way)
         if (chi2 := chi2_with(S)) < gate and not self.drift.alike_elsewhere(implied, S):

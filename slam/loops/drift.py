@@ -13,11 +13,13 @@ from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.geometry import adjoint, inverse, se3_exp, se3_log
 from bmask_slam.loops.noise import DIMENSIONS, NoiseConfig
 from bmask_slam.loops.verification import LoopConstraint
-from bmask_slam.world.covisibility import CovisiblePaths
+from bmask_slam.world.covisibility import CovisiblePaths, Way
 from bmask_slam.world.world_map import WorldMap
 
 ALIKE_FOR_M = 4.0
 """For so much of a way errors are alike; on longer ways they are a sum of independent ones."""
+LEAST_SHARED = 10
+"""A link of fewer landmarks is held as well as by so many: by tracking and what else is near."""
 INFORMATIVE = 9.0
 """Loops tell of the drift where its covariance is so many times as large as their own."""
 
@@ -61,9 +63,9 @@ class MapDrift:
         learned_sum, closings, alike = state["learned"].tolist()
         self._sum, self._closings, self.places_look_alike = learned_sum, int(closings), bool(alike)
 
-    def covariance(self, way: Array) -> Array:
-        """Covariance (6, 6) of T_a_b, as a tangent in b, by a way's poses (N, 4, 4) from a to b."""
-        return self._floor + self.scale * self._possible(way)
+    def covariance(self, way: Way) -> Array:
+        """Covariance (6, 6) of T_a_b, as a tangent in b, by a way from a to b."""
+        return self.floor + self.scale * self._possible(way)
 
     def alike_elsewhere(self, implied: Array, S: Array) -> bool:
         """Whether a loop is explained better by a place that looks alike than by drift.
@@ -90,50 +92,53 @@ class MapDrift:
         Keyframes that show the same place are within ``reach_m``. Those that the map has further
         apart imply so much drift at least: too much, or less likely than a look-alike.
         """
-        if not self.places_look_alike or not len(way := paths.way(*ends)):
+        if not self.places_look_alike or not len((way := paths.way(*ends)).poses):
             return False
         S_moved = self.covariance(way)[3:, 3:]
-        apart_m = float(np.linalg.norm(way[0, :3, 3] - way[-1, :3, 3]))
+        apart_m = float(np.linalg.norm(way.poses[0, :3, 3] - way.poses[-1, :3, 3]))
         beyond_m = max(apart_m - self.config.reach_m, 0.0)
         least_chi2 = beyond_m**2 / float(np.linalg.eigvalsh(S_moved)[-1])
         return least_chi2 > gate or self._alike_likelier(least_chi2, S_moved)
 
     def learn(
-        self, implied: Sequence[Array], covariances: Sequence[Array], ways: Sequence[Array]
+        self, implied: Sequence[Array], covariances: Sequence[Array], ways: Sequence[Way]
     ) -> None:
         """Learn from N loops that were confirmed together, which count once.
 
         Args:
             implied: (6,) the drift that each implies, as a tangent [rotation rad, m].
             covariances: (6, 6) of the loops themselves.
-            ways: poses (N, 4, 4) on the ways between their ends; N = 0 is no way.
+            ways: those between their ends.
         """
         shares = []
         for xi, own, way in zip(implied, covariances, ways, strict=True):
-            possible = self._floor + self._possible(way)
-            if len(way) and (np.diagonal(possible) > INFORMATIVE * np.diagonal(own)).all():
+            possible = self.floor + self._possible(way)
+            if len(way.poses) and (np.diagonal(possible) > INFORMATIVE * np.diagonal(own)).all():
                 shares.append(float(mahalanobis(xi[None], possible[None])[0]) / DIMENSIONS)
         if shares:
             self._sum += float(np.mean(shares))
             self._closings += 1
 
     @property
-    def _floor(self) -> Array:
+    def floor(self) -> Array:
+        """Covariance (6, 6) of T_a_b without any way between a and b."""
         return diagonal_covariance(self.config.model_sigma_rad, self.config.model_sigma_m)
 
-    def _possible(self, way: Array) -> Array:
+    def _possible(self, way: Way) -> Array:
         """The drift that ``NoiseConfig`` states, carried to the end of a way by adjoints.
 
         An error of the camera model or of the depth's scale is the same for the whole way, so that
         those of turns to the left and to the right cancel, and those of the way there and back:
         each component of a turn adds an unknown multiple of itself to all six of the step, each
         move is too long by an unknown share. Other errors are alike for ``ALIKE_FOR_M`` of a way.
+        Each step adds the error of its own link, which few landmarks in common hold badly.
         """
-        if len(way) < 2:
+        poses, shared = way
+        if len(poses) < 2:
             return np.zeros((DIMENSIONS, DIMENSIONS))
         rules = self.config
-        steps = se3_log(inverse(way[:-1]) @ way[1:])
-        to_end = adjoint(inverse(way[-1]) @ way[:-1] @ se3_exp(steps / 2))
+        steps = se3_log(inverse(poses[:-1]) @ poses[1:])
+        to_end = adjoint(inverse(poses[-1]) @ poses[:-1] @ se3_exp(steps / 2))
         bent = np.einsum("nij,nk->ijk", to_end, steps[:, :3]).reshape(DIMENSIONS, -1)
         lengths_m = np.linalg.norm(steps[:, 3:], axis=1)
         walked_m = np.cumsum(lengths_m) - lengths_m
@@ -143,7 +148,9 @@ class MapDrift:
         drifted = (walked @ per_m @ walked.swapaxes(1, 2)).sum(axis=0)
         too_long = np.einsum("nij,nj->i", to_end[:, :, 3:], steps[:, 3:])
         scale = rules.drift_m_per_m**2 * np.outer(too_long, too_long)
-        return rules.model_share**2 * bent @ bent.T + scale + drifted
+        linked = to_end * (rules.link_rad / np.maximum(shared, LEAST_SHARED))[:, None, None]
+        links = (linked @ linked.swapaxes(1, 2)).sum(axis=0)
+        return rules.model_share**2 * bent @ bent.T + scale + drifted + links
 
 
 def implied_drift(loop: LoopConstraint, world: WorldMap) -> Array:

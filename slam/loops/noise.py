@@ -27,13 +27,15 @@ class NoiseConfig:
     The map's relative pose is trusted within ``drift_rad_per_m`` and ``drift_m_per_m`` of its
     path. Errors of the camera model (a wrong focal length, rows exposed in turn) grow with turns:
     ``model_share`` of the angle turned on the way, and as many metres, since points are some metres
-    away. Without any path the sigmas are ``model_sigma_rad`` and ``model_sigma_m``. How far the map
-    can have drifted over long ways is learned from loops (`loops.drift`), with the weight of
-    ``prior_closings`` and the factor ``drift_margin`` on the covariance; where places look alike,
-    by a loop with ``alike_excess`` times the chi-square allowed, it is ``alike_share`` of that, and
-    a loop must be ``alike_odds`` times likelier to be right than to be of one of the look-alikes,
-    which are ``alike_spacing_m`` apart. There keyframes are compared only if a loop between them
-    could be accepted: those that show one place are within ``reach_m`` of each other.
+    away. Keyframes that share few landmarks, as those of blurred images do, are badly linked: each
+    step adds ``link_rad``, and as many metres, over the number of landmarks that its keyframes have
+    in common. Without any path the sigmas are ``model_sigma_rad`` and ``model_sigma_m``. How far
+    the map can have drifted over long ways is learned from loops (`loops.drift`), with the weight
+    of ``prior_closings`` and the factor ``drift_margin`` on the covariance; where places look
+    alike, by a loop with ``alike_excess`` times the chi-square allowed, it is ``alike_share`` of
+    that, and a loop must be ``alike_odds`` times likelier to be right than to be of one of the
+    look-alikes, which are ``alike_spacing_m`` apart. There keyframes are compared only if a loop
+    between them could be accepted: those that show one place are within ``reach_m`` of each other.
     """
 
     prior_ratio: float = 4.0
@@ -44,6 +46,7 @@ class NoiseConfig:
     model_sigma_rad: float = 0.003
     model_sigma_m: float = 0.005
     model_share: float = 0.02
+    link_rad: float = 0.2
     prior_closings: float = 1.0
     drift_margin: float = 2.0
     alike_excess: float = 9.0

@@ -16,21 +16,37 @@ from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
 from bmask_slam.loops.drift import MapDrift
 from bmask_slam.loops.noise import LoopNoise, NoiseConfig
 from bmask_slam.loops.verification import LoopConstraint
-from bmask_slam.world.covisibility import CovisiblePaths
+from bmask_slam.world.covisibility import CovisiblePaths, Way
 from bmask_slam.world.world_map import WorldMap
 
 STATED = np.diag([2e-3, 1e-3, 1e-3, 2e-3, 4e-3, 6e-3]) ** 2
 REAL_RATIO = 9.0
 COUNT = 60
+SHARED = 200
+"""Landmarks that each two keyframes in turn have in common, unless a test says otherwise."""
+
+
+def world_of(poses: Array, shared: int = SHARED) -> WorldMap:
+    """A map whose keyframes share so many landmarks with the one before and the one after."""
+    world, rows, before = WorldMap(), np.arange(shared), np.zeros(0, np.int64)
+    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (2 * shared, 3))
+    for T_world_camera in poses:
+        features = make_features(np.eye(4), points, np.zeros((2 * shared, 8), np.uint64))
+        keyframe = add_keyframe(world, T_world_camera, features)
+        world.attach(keyframe, rows[: len(before)], before)
+        before = world.make_landmarks(keyframe, shared + rows, points[shared:])
+    return world
+
+
+def linked(poses: Array) -> Way:
+    """A way whose links are as good as exact."""
+    return Way(poses, np.full(max(len(poses) - 1, 0), 10**9))
 
 
 def turning_world(step_m: float, T_move: Array | None = None) -> WorldMap:
     """An exact map of 2 x 60 keyframes that turn, where keyframe 60 + k is near keyframe k."""
-    world, T_move = WorldMap(), np.eye(4) if T_move is None else T_move
-    nothing = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
-    for k in range(2 * COUNT):
-        add_keyframe(world, T_move @ se3_exp([0.1, 0.05 * k, 0.3, step_m * k, 0, 0.1]), nothing)
-    return world
+    poses = [se3_exp([0.1, 0.05 * k, 0.3, step_m * k, 0, 0.1]) for k in range(2 * COUNT)]
+    return world_of((np.eye(4) if T_move is None else T_move) @ poses)
 
 
 def noisy_loops(world: WorldMap, ratio: float, count: int = COUNT) -> list[LoopConstraint]:
@@ -121,6 +137,30 @@ def test_a_map_may_be_bent_by_turns_not_without(a: int, b: int, fits: bool) -> N
     assert not closer._within_drift(alias, world, CovisiblePaths(world))
 
 
+@pytest.mark.parametrize(("shared", "fits"), [(11, True), (90, False), (SHARED, False)])
+def test_a_map_may_be_bent_at_keyframes_that_share_few_landmarks(shared: int, fits: bool) -> None:
+    """2 degrees and 3 cm, as where freiburg1_rpy, played backward, turns by 170 degrees/s."""
+    poses = [se3_exp([0, 0, 0, 0.1 * k, 0, 0]) for k in range(4)]
+    closer = LoopCloser(CAMERA, LoopClosingConfig(), EventLog())
+    T_bent = inverse(poses[0]) @ poses[3] @ se3_exp([0.0, 0.035, 0.0, 0.02, 0.0, 0.02])
+    world = world_of(poses, shared)
+    loop = replace(noisy_loops(turning_world(0.01), 1.0, 1)[0], keyframe_b=3, T_a_b=T_bent)
+    assert closer._within_drift(loop, world, CovisiblePaths(world)) == fits
+
+
+def test_a_weak_link_bends_all_that_comes_after() -> None:
+    """Sigmas of 0.01 rad at 3 m from the end move the end sideways by 3 cm."""
+    rules = replace(NoiseConfig(), drift_rad_per_m=0.0, drift_m_per_m=0.0, model_share=0.0)
+    shared, weak = np.full(4, 10**9), Way(straight(4), np.full(4, 10**9))
+    shared[0] = rules.link_rad / 0.01
+    weak = weak._replace(shared=shared)
+    drift = MapDrift(rules)
+    links = drift.covariance(weak) - drift.covariance(linked(weak.poses))
+    sigmas = np.sqrt(np.diagonal(links))
+    np.testing.assert_allclose(sigmas[:3], 0.01)
+    np.testing.assert_allclose(sigmas[3:], [0.01 * np.hypot(1, 3.5)] * 2 + [0.01], rtol=1e-6)
+
+
 def test_the_path_is_in_radians_and_metres() -> None:
     ids, travelled = turning_world(0.01).travelled()
     assert ids.tolist() == list(range(2 * COUNT))
@@ -178,7 +218,7 @@ def test_how_drift_grows_on_a_way(
     way: Array, sigma_rad: float, sigma_m: tuple[float, float]
 ) -> None:
     """The sigmas of turns about y, and of moves sideways and ahead."""
-    sigmas = np.sqrt(np.diagonal(MapDrift(NoiseConfig()).covariance(way)))
+    sigmas = np.sqrt(np.diagonal(MapDrift(NoiseConfig()).covariance(linked(way))))
     np.testing.assert_allclose(sigmas[1], sigma_rad, rtol=1e-3)
     np.testing.assert_allclose(sigmas[[3, 5]], sigma_m, rtol=1e-2)
 
@@ -198,7 +238,8 @@ def test_drift_is_that_of_simulated_ways() -> None:
     for half, error in zip(se3_exp(steps / 2), errors.swapaxes(0, 1), strict=True):
         T = T @ half @ error @ half
     sampled = 100 * np.cov(se3_log(inverse(way[-1]) @ T).T)
-    drift = MapDrift(replace(rules, model_sigma_rad=0.0, model_sigma_m=0.0)).covariance(way)
+    drift = MapDrift(replace(rules, model_sigma_rad=0.0, model_sigma_m=0.0))
+    drift = drift.covariance(linked(way))
     sigmas = np.sqrt(np.diagonal(drift))
     unit = np.outer(sigmas, sigmas)
     np.testing.assert_allclose(sampled / unit, drift / unit, atol=0.07)
@@ -206,10 +247,10 @@ def test_drift_is_that_of_simulated_ways() -> None:
 
 def test_drift_is_less_where_loops_have_shown_less_and_never_more_than_assumed() -> None:
     """Loops after 24 m of way: their implied drift is 1 % of what was possible, then all of it."""
-    drift, way = MapDrift(NoiseConfig()), walk()
+    drift, way = MapDrift(NoiseConfig()), linked(walk())
     assumed = drift.covariance(way)
     root, rng = np.linalg.cholesky(assumed), np.random.default_rng(5)
-    own, none = 1e-6 * np.eye(6), np.zeros((0, 4, 4))
+    own, none = 1e-6 * np.eye(6), linked(np.zeros((0, 4, 4)))
     for _ in range(20):
         drift.learn(0.1 * rng.normal(size=(3, 6)) @ root.T, [own] * 3, [way] * 3)
     # (1 + 20 * 0.01) / 21, times 2
@@ -245,7 +286,7 @@ def test_a_look_alike_must_be_less_likely_than_the_drift(
 ) -> None:
     """There and back, to a place beside where the map has it; after 250 m that tells nothing."""
     drift = MapDrift(NoiseConfig())
-    way = np.concatenate([straight(length_m // 2), straight(length_m // 2)[-2::-1]])
+    way = linked(np.concatenate([straight(length_m // 2), straight(length_m // 2)[-2::-1]]))
     implied = np.array([0, 0, 0, implied_m, 0, 0])
     assert not drift.alike_elsewhere(implied, STATED + drift.covariance(way))
     drift.places_look_alike = True
@@ -257,13 +298,11 @@ def test_a_room_that_looks_like_another_is_no_loop() -> None:
 
     What lies far beyond the gate shows that places look alike; then less drift is allowed.
     """
-    world = WorldMap()
-    nothing = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
-    for k in range(27):
-        x_m = k if k < 16 else 32 - k  # there and part of the way back
-        add_keyframe(
-            world, se3_exp([0, 0, 0, x_m, 0, 0]) @ se3_exp([0, 0.5 * k, 0, 0, 0, 0]), nothing
-        )
+    places_m = [k if k < 16 else 32 - k for k in range(27)]  # there and part of the way back
+    world = world_of([
+        se3_exp([0, 0, 0, x_m, 0, 0]) @ se3_exp([0, 0.5 * k, 0, 0, 0, 0])
+        for k, x_m in enumerate(places_m)
+    ])  # fmt: skip
     closer = LoopCloser(CAMERA, LoopClosingConfig(), EventLog())
     a, b = (world.keyframes[k].T_world_camera for k in (0, 26))
     paths, loop = CovisiblePaths(world), noisy_loops(turning_world(0.01), 1.0, 1)[0]
@@ -287,17 +326,14 @@ def test_places_out_of_reach_are_those_whose_every_loop_would_be_refused(
     there = straight(length_m // 2)
     way = np.concatenate([there, there[-2::-1]])
     way[:, 1, 3] += np.linspace(0, apart_m, len(way))
-    world, ends = WorldMap(), (0, len(way) - 1)
-    nothing = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
-    for T_world_camera in way:
-        add_keyframe(world, T_world_camera, nothing)
+    world, ends = world_of(way), (0, len(way) - 1)
     paths = CovisiblePaths(world)
     assert not drift.out_of_reach(ends, paths, gate)
     drift.places_look_alike = True
     assert drift.out_of_reach(ends, paths, gate) == beyond
     if not beyond:
         return
-    S = drift.covariance(way)
+    S = drift.covariance(paths.way(*ends))
     rng = np.random.default_rng(0)
     T_a_b = inverse(way[0]) @ way[-1]
     for direction in rng.normal(size=(200, 3)):

@@ -29,11 +29,11 @@ def out_and_back() -> tuple[WorldMap, list[Keyframe]]:
 def test_without_common_landmarks_the_way_is_that_of_the_camera() -> None:
     world, keyframes = out_and_back()
     paths = CovisiblePaths(world)
-    np.testing.assert_array_equal(paths.way(0, COUNT - 1), [k.T_world_camera for k in keyframes])
-    np.testing.assert_array_equal(
-        paths.way(COUNT - 1, 2), [k.T_world_camera for k in keyframes[:1:-1]]
-    )
-    np.testing.assert_array_equal(paths.way(3, 3), keyframes[3].T_world_camera[None])
+    poses = np.array([k.T_world_camera for k in keyframes])
+    np.testing.assert_array_equal(paths.way(0, COUNT - 1).poses, poses)
+    np.testing.assert_array_equal(paths.way(COUNT - 1, 2).poses, poses[:1:-1])
+    np.testing.assert_array_equal(paths.way(3, 3).poses, poses[3:4])
+    assert paths.way(0, 4).shared.tolist() == [0] * 4
     assert [paths.length_m(*ends) for ends in ((0, COUNT - 1), (3, 3))] == [9, 0]
 
 
@@ -44,16 +44,26 @@ def test_landmarks_that_were_seen_again_make_it_shorter(shared: int) -> None:
     ids = world.make_landmarks(keyframes[2], rows, np.ones((shared, 3)))
     world.attach(keyframes[10], rows, ids)  # where it was before, looking the other way
     taken = [0, 1, 2, 10, 11] if shared == MIN_SHARED else range(COUNT)
-    np.testing.assert_array_equal(
-        CovisiblePaths(world).way(0, COUNT - 1), [keyframes[k].T_world_camera for k in taken]
-    )
+    way = CovisiblePaths(world).way(0, COUNT - 1)
+    np.testing.assert_array_equal(way.poses, [keyframes[k].T_world_camera for k in taken])
+
+
+@pytest.mark.parametrize("shared", [MIN_SHARED - 1, MIN_SHARED])
+@pytest.mark.parametrize("turned", [1, -1])
+def test_a_way_tells_how_many_landmarks_its_steps_share(shared: int, turned: int) -> None:
+    world, keyframes = out_and_back()
+    rows = np.arange(shared)
+    ids = world.make_landmarks(keyframes[2], rows, np.ones((shared, 3)))
+    world.attach(keyframes[3], rows, ids)
+    counted = CovisiblePaths(world).way(*(1, 5)[::turned]).shared
+    assert counted.tolist() == [0, shared, 0, 0][::turned]
 
 
 def test_culled_keyframes_are_stepped_over() -> None:
     world, keyframes = out_and_back()
     world.remove_keyframe(keyframes[3], keyframes[2])
     assert CovisiblePaths(world).length_m(0, 5) == 5
-    assert len(CovisiblePaths(world).way(0, 5)) == 5
+    assert len(CovisiblePaths(world).way(0, 5).poses) == 5
 
 
 def test_segments_have_no_way_between_them() -> None:
@@ -61,7 +71,7 @@ def test_segments_have_no_way_between_them() -> None:
     for keyframe in keyframes[4:8]:
         keyframe.segment = 1
     paths = CovisiblePaths(world)
-    assert paths.way(0, 5).shape == (0, 4, 4)
+    assert [len(part) for part in paths.way(0, 5)] == [0, 0]
     assert np.isinf(paths.length_m(0, 5))
     assert [paths.length_m(*ends) for ends in ((4, 6), (3, 8))] == [1, 1]
 
@@ -102,10 +112,8 @@ def test_neighbours_that_follow_a_map_are_those_of_a_new_look(
     for _ in range(150):
         for _ in range(rng.integers(1, 4)):
             change_at_random(world, rng)
-        ids, poses, costs = neighbours.steps(world)
-        new_ids, new_poses, new_costs = Neighbours().steps(world)
-        np.testing.assert_array_equal(ids, new_ids)
-        np.testing.assert_array_equal(poses, new_poses)
-        np.testing.assert_array_equal(costs.toarray(), new_costs.toarray())
-        most = max(most, costs.nnz - len(ids) + 1)
+        steps = neighbours.steps(world)
+        for kept, new in zip(steps, Neighbours().steps(world), strict=True):
+            np.testing.assert_array_equal(kept, new)
+        most = max(most, len(steps.pairs) - len(steps.ids) + 1)
     assert most > 1  # landmarks made neighbours of some that do not follow each other
