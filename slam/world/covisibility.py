@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -36,7 +37,8 @@ class Way(NamedTuple):
     shared: Ints
 
 
-class _Steps(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Steps:
     """Pairs (P,) of neighbours, ascending, among K keyframes: landmarks shared, and costs.
 
     Those that only follow each other in a segment share 0 here.
