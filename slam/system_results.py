@@ -38,6 +38,7 @@ NEWER_ARRAYS = (
     "mapper.events.",
     "mapper.history.information",
     "mapper.loops.noise.",
+    "mapper.world.landmarks.spare",
     "mapper.loops.drift.",
     "mapper.loops.recogniser.dismissed",
     "localiser.images.",

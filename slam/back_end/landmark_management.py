@@ -45,12 +45,20 @@ class MappingConfig:
     triangulation: TriangulationConfig = field(default_factory=TriangulationConfig)
 
 
-def create_landmarks(world: WorldMap, keyframe: Keyframe, camera: Camera) -> Ints:
-    """Landmarks from every keypoint of a keyframe that has depth and no landmark yet."""
+def create_landmarks(
+    world: WorldMap, keyframe: Keyframe, camera: Camera, new_ids: Ints | None = None
+) -> Ints:
+    """Landmarks from every keypoint of a keyframe that has depth and no landmark yet; their ids.
+
+    ``new_ids`` are as of ``Tracked``.
+    """
     features = keyframe.features
     free = np.flatnonzero(keyframe.free & np.isfinite(features.depth_m))
     points = camera.backproject(features.pixels[free], features.depth_m[free])
-    return world.make_landmarks(keyframe, free, transform(keyframe.T_world_camera, points))
+    points_world = transform(keyframe.T_world_camera, points)
+    given = new_ids[free] if new_ids is not None and len(new_ids) else None
+    ids = world.make_landmarks(keyframe, free, points_world, given)
+    return ids[ids >= 0]
 
 
 def fuse_into_neighbours(

@@ -80,6 +80,7 @@ class Mapper:
 
     idle = accepts_keyframes = True
     """Whether it waits for work, and will work on a keyframe: updates end before the next frame."""
+    landmarks_ahead = np.zeros(0, np.int64)
 
     def state(self) -> Arrays:
         """Map, history and graph as named arrays."""
@@ -124,7 +125,7 @@ class Mapper:
         world = self.world
         keyframe = add_keyframe(world, frame, tracked, segment)
         world.attach(keyframe, tracked.keypoints, tracked.landmark_ids)
-        new_ids = create_landmarks(world, keyframe, self.camera)
+        new_ids = create_landmarks(world, keyframe, self.camera, tracked.new_ids)
         fused = fuse_into_neighbours(world, keyframe, new_ids, self._tracker, self._mapping)
         triangulate_landmarks(world, keyframe, self.camera, self._mapping.triangulation)
         world.renew_patches(keyframe, self._tracker.config.subpixel)

@@ -45,8 +45,8 @@ def triangulate_landmarks(
         poses = (keyframe.T_world_camera, neighbour.T_world_camera)
         points_world, good = triangulate(pixels, sigmas, poses, camera, config)
         ids = world.make_landmarks(keyframe, rows[good], points_world[good])
-        world.attach(neighbour, neighbour_rows[good], ids)
-        made.append(ids)
+        world.attach(neighbour, neighbour_rows[good][ids >= 0], ids[ids >= 0])
+        made.append(ids[ids >= 0])
     return np.concatenate(made)
 
 

@@ -46,6 +46,7 @@ class NewKeyframe:
         reference: id of a keyframe and the T_world_camera that tracking knew of it, relative to
             which ``tracked.T_world_camera`` holds; None if the frame begins a segment.
         local_ids: (N,) landmarks that it was tracked against.
+        reserved: first of the ids of its landmarks, and what follows the last.
         visibility: counts of the frames since the last keyframe.
         history: the frames since the last keyframe.
         depth_m: (h, w) every second pixel of its z-depth, for its masks; (0, w) if there are none.
@@ -58,6 +59,7 @@ class NewKeyframe:
     segment: int
     reference: tuple[int, Array] | None
     local_ids: Ints
+    reserved: tuple[int, int]
     visibility: VisibilityCounts
     history: Entries
     depth_m: Floats
@@ -151,12 +153,14 @@ class PruneMask:
 class RestoreObservations:
     """To the map: masked keypoints (N,) of a keyframe turned out to be static; restore them.
 
-    ``patches`` (N) are those of the landmarks that they observed before.
+    ``patches`` (N) are those of the landmarks that they observed before; ``reserved`` is as of
+    ``NewKeyframe``.
     """
 
     keyframe_id: int
     keypoints: Ints
     patches: Patches
+    reserved: tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)

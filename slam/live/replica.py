@@ -14,8 +14,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.back_end.landmark_management import create_landmarks
 from bmask_slam.features.brisk import Features
+from bmask_slam.features.patch_alignment import SubpixelConfig
 from bmask_slam.graph.arrays import Array, Arrays, Bits, Bytes, Ints, Mask
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import carried_along
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.keyframe import Keyframe
@@ -173,13 +176,35 @@ def digest_rows(columns: Sequence[NDArray]) -> Bits:
     return digests
 
 
+def landmarks_ahead(
+    world: WorldMap, keyframe: Keyframe, camera: Camera, subpixel: SubpixelConfig
+) -> tuple[Ints, tuple[int, int]]:
+    """Make landmarks of a new keyframe in a copy, to be tracked before the owner has made them.
+
+    The keyframe does not observe them yet. Returns their ids, -1 for none, by keypoint (N,), and
+    the ids that are reserved: the first, and what follows the last. These are as many as there are
+    keypoints without a landmark, since the owner needs some of its own.
+    """
+    table = world.landmarks
+    first = len(table)
+    reserved = first, first + int(np.count_nonzero(keyframe.free))
+    ids = create_landmarks(world, keyframe, camera)
+    table.visible[ids] = table.found[ids] = 0  # the owner counts the keyframe
+    table.reserve(*reserved, ids)
+    world.renew_patches(keyframe, subpixel)
+    new_ids = np.where(keyframe.landmark_ids >= first, keyframe.landmark_ids, -1)
+    world.observe(keyframe, np.flatnonzero(new_ids >= 0), -1)
+    return new_ids, reserved
+
+
 def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> None:
     """Make a copy of the map equal to its owner's.
 
-    Keyframes that the owner has not received yet stay, and keep their pose relative to the newest
-    keyframe that both have. An owner that was restarted from an older state may have fewer
-    landmarks, which then stay here as ones that are not in the map, and keyframes that had been
-    culled.
+    Keyframes that the owner has not received yet stay, with the landmarks that were made of them
+    ahead, and keep their pose relative to the newest keyframe that both have. An owner that was
+    restarted from an older state may have fewer keyframes, which are then such, and fewer landmarks
+    that it has made itself, which then stay as ones that are not in the map. It may also have
+    keyframes that had been culled.
     """
     _apply_landmarks(delta, world)
     pending = [k for k in world.keyframes.values() if k.id >= delta.next_keyframe_id]
@@ -188,8 +213,12 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
     if pending and shared:
         newest = world.keyframes[shared[-1]]
         T_old, T_new = newest.T_world_camera, poses[newest.id]
+        before = np.array([k.T_world_camera for k in pending])
         for keyframe in pending:
             keyframe.T_world_camera = carried_along(keyframe.T_world_camera, T_old, T_new)
+        after = np.array([k.T_world_camera for k in pending])
+        ids = np.flatnonzero(_ahead(delta, world))
+        world.landmarks.move_with_hosts(ids, np.array([k.id for k in pending]), before, after)
     segments = dict(zip(delta.keyframe_ids.tolist(), delta.segments.tolist(), strict=True))
     kept = {i: _keyframe(i, delta, world) for i in poses}
     for keyframe in kept.values():
@@ -205,7 +234,7 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
 def _apply_landmarks(delta: WorldDelta, world: WorldMap) -> None:
     table = world.landmarks
     table.extend_to(max(delta.size, len(table)))
-    in_map = np.zeros(len(table), bool)
+    in_map = _ahead(delta, world)
     in_map[: delta.size] = np.unpackbits(delta.in_map, count=delta.size)
     table.set_in_map(in_map)
     table.points_world[delta.moved] = delta.points_world
@@ -214,6 +243,15 @@ def _apply_landmarks(delta: WorldDelta, world: WorldMap) -> None:
     if delta.replaced_by is not None:
         table.replaced_by[: delta.size] = delta.replaced_by
         table.replaced_by[delta.size :] = -1
+
+
+def _ahead(delta: WorldDelta, world: WorldMap) -> Mask:
+    """The landmarks (N,) of the copy that were made of keyframes that the owner has not yet."""
+    table = world.landmarks
+    ahead = table.in_map & (table.host >= delta.next_keyframe_id)
+    ahead[: delta.size] = False
+    ahead[table.spare] = False  # the owner made these
+    return ahead
 
 
 def _keyframe(keyframe_id: int, delta: WorldDelta, world: WorldMap) -> Keyframe:

@@ -40,8 +40,6 @@ from bmask_slam.world.keyframe import Keyframe
 if TYPE_CHECKING:  # it loads torch
     from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 
-FIRST_MAP_S = 5.0
-"""Longest wait of the first frame of a map for its landmarks."""
 MASKS_S = 10.0
 """Longest wait for the masks of the last keyframes at the end."""
 CALIBRATION_S = 15.0
@@ -99,7 +97,7 @@ class LiveSystem(SlamSystem):
             self.remote = self.mapper_type(camera, config, self.label_names, place)
             undo.callback(self.remote.close)
             super().__init__(camera, config, back_end=self.remote)
-            self.remote.wait_until_ready(RestartPolicy().start_s)
+            self.remote.worker.wait_until_ready(RestartPolicy().start_s)
             if dense is not None:
                 dense.wait_until_ready()
             self.semantics = _RemoteSemantics(self)
@@ -112,14 +110,6 @@ class LiveSystem(SlamSystem):
         result = super().process(frame, features)
         if self.calibration is not None:
             self.calibration.add_frame(frame, self._keyframe(result))
-        first = self.camera_tracker.reference
-        if result.keyframe_id is None or first is None:
-            return result
-        if self.remote.world.in_segment(first.segment) == [first]:
-            T_before = first.T_world_camera
-            for masks in self.remote.wait_for(first, FIRST_MAP_S):
-                self.moving_objects.observe_masks(masks)
-            self._follow_map(first, T_before)
         return result
 
     def _keyframe(self, result: FrameResult) -> Keyframe | None:
@@ -129,6 +119,7 @@ class LiveSystem(SlamSystem):
 
     def _map_uses_camera(self, camera: Camera, motions: Mapping[int, KeyframeMotion]) -> None:
         """Tell the map; tracking uses the camera from the next frame on."""
+        self.remote.camera = camera
         self.remote.send(UseCamera(camera, dict(motions)))
 
     def add_measurements(self, new: Measurements) -> None:

@@ -29,7 +29,6 @@ from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.frame_history import FrameHistory
-from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
@@ -109,12 +108,6 @@ class LockstepMapper(RemoteMapper):
             if isinstance(message, Handled):
                 self._handled = max(message.number, self._handled)
             others += super()._apply_answers([message])
-        return others
-
-    def wait_for(self, keyframe: Keyframe, timeout_s: float) -> list[Any]:
-        """Use all answers, so that a keyframe has its landmarks; returns as ``catch_up``."""
-        self.use_all()
-        others, self._kept = self._kept, []
         return others
 
     def send_frames(self) -> None:

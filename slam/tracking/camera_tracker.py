@@ -13,13 +13,10 @@ from bmask_slam.tracking.guided_landmarks import GuidedLandmarks
 from bmask_slam.tracking.motion_model import MotionModel
 from bmask_slam.tracking.relocalisation import RelocalisationConfig, is_within_reach, relocalise
 from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, more, reckoned, untracked
-from bmask_slam.tracking.rolling_shutter import PreviousPose
 from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
 from bmask_slam.world.map_editor import MapReader
-
-MAX_AGO_S = 0.2  # the velocity for the rolling shutter is not taken from an older pose
 
 
 class CameraTracker:
@@ -100,10 +97,7 @@ class CameraTracker:
         self._motion.restart(T_world_camera)
 
     def begin_frame(self, timestamp_s: float) -> None:
-        """Set the time of the frame that is tracked next.
-
-        Without it the interval is taken to be the same as the last one.
-        """
+        """Set the time of the frame that is tracked next; else the last interval is repeated."""
         self._motion.now_s = timestamp_s
         self._images.end_frame()
 
@@ -182,7 +176,8 @@ class CameraTracker:
             self.lost_frames += 1
             self._images.end_frame()
             self._motion.stop()
-            return self._by_odometry(tracked)
+            moved = self._motion.by_odometry(self._map.sensors)
+            return tracked if moved is None else reckoned(tracked, *moved)
         world.landmarks.visible[tracked.visible_ids] += 1
         world.landmarks.found[tracked.landmark_ids] += 1
         return tracked
@@ -248,8 +243,8 @@ class CameraTracker:
         self._local_ids = local_landmarks(world, observed, self._local_map)
 
     def _tracked(self, features: Features, local_ids: Ints) -> Tracked:
-        T, recent_ids, world = self._predicted(), self._recent_ids, self._map.world
-        return self.tracker.track(features, T, recent_ids, local_ids, world, self._previous())
+        T, world, last = self._predicted(), self._map.world, self._motion.previous(self.lost_frames)
+        return self.tracker.track(features, T, self._recent_ids, local_ids, world, last)
 
     def _follow(self, features: Features) -> None:
         """Follow the last frame's corners into this one."""
@@ -257,6 +252,20 @@ class CameraTracker:
         self._images.follow(features, T_last_next, self._motion.ago_s)
 
     def _tracked_in_image(self, features: Features) -> Tracked:
+        """The pose by the local map; where that ends, by the landmarks ahead of the map as well."""
+        tracked, known, ahead = self._nearby(features), self._local_ids, self._map.landmarks_ahead
+        few = tracked.firm < self._images.config.few_inliers
+        if not few or not len(ahead):
+            return tracked
+        seen, *_ = self.tracker.in_view(self._predicted(), known, self._map.world.landmarks)
+        if len(seen) >= len(features):  # it does not end: something is before it, and may move
+            return tracked
+        self._local_ids = np.concatenate([known, ahead])
+        tracked = more(tracked, self._nearby(features), self.tracker.config.min_inliers)
+        self._local_ids = known
+        return tracked
+
+    def _nearby(self, features: Features) -> Tracked:
         """The pose by the local map, with the help of the image's motion where there is need."""
         enough = self.tracker.config.min_inliers
         if self._images.followed is not None:
@@ -274,7 +283,8 @@ class CameraTracker:
         """The pose by the local map, of which landmarks were followed from the last image."""
         T, ids, world = self._predicted(), self._local_ids, self._map.world
         guided = self._images.guided(features, ids, world.landmarks)
-        return self.tracker.refine(features, T, ids, world, self._previous(), guided)
+        last = self._motion.previous(self.lost_frames)
+        return self.tracker.refine(features, T, ids, world, last, guided)
 
     def _predicted(self) -> Array:
         """T_world_camera (4, 4), by the image's motion if that is known, else by velocity."""
@@ -287,14 +297,3 @@ class CameraTracker:
         """T_world_camera (4, 4) by the last motion; in a blackout by odometry if that knows it."""
         moved = self._motion.by_odometry(self._map.sensors) if self.lost_frames else None
         return self._motion.by_velocity() if moved is None else moved[0]
-
-    def _by_odometry(self, tracked: Tracked) -> Tracked:
-        """A frame that the image gives no pose, with that of odometry if there is one."""
-        moved = self._motion.by_odometry(self._map.sensors)
-        return tracked if moved is None else reckoned(tracked, moved[0], moved[1].covariance)
-
-    def _previous(self) -> PreviousPose | None:
-        """The last frame's pose; None where it is too old to give a velocity."""
-        ago_s = self._motion.ago_s
-        recent = self.lost_frames == 0 and 0 < ago_s < MAX_AGO_S  # False for NaN
-        return PreviousPose(self._motion.T_world_last, ago_s) if recent else None

@@ -7,9 +7,12 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Arrays
 from bmask_slam.graph.geometry import carried_along, inverse, orthonormalised, se3_exp, se3_log
 from bmask_slam.graph.sensors.odometry import Motion, MotionSensor
+from bmask_slam.tracking.rolling_shutter import PreviousPose
 
 UNEVEN = 0.25
 """Frames count as evenly spaced if their intervals differ by a smaller share."""
+MAX_AGO_S = 0.2
+"""The velocity for the rolling shutter is not taken from an older pose."""
 MAX_STEPS = 4.0
 """The motion is extrapolated over at most so many times the interval in which it was measured."""
 
@@ -45,6 +48,11 @@ class MotionModel:
     def ago_s(self) -> float:
         """Time from the last pose to the present frame."""
         return self.now_s - self.last_s
+
+    def previous(self, lost_frames: int) -> PreviousPose | None:
+        """The last pose; None where it is too old to give a velocity, or frames were lost since."""
+        recent = lost_frames == 0 and 0 < self.ago_s < MAX_AGO_S  # False for NaN
+        return PreviousPose(self.T_world_last, self.ago_s) if recent else None
 
     def restart(self, T_world_camera: Array) -> None:
         """Begin at a pose (4, 4), without speed."""

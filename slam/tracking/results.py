@@ -10,6 +10,7 @@ import numpy as np
 from bmask_slam.events import Event
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Ints, no_ids
+from bmask_slam.graph.sensors.odometry import Motion
 
 
 class TrackingStatus(Enum):
@@ -43,6 +44,8 @@ class Tracked:
         visible_ids: landmarks of the local map that project into the frame.
         information: (6, 6) of the pose.
         flow_only: those of the landmarks that rest on the flow of the image alone.
+        new_ids: (N,) the landmark that tracking has made of each keypoint ahead of the map, -1 for
+            none; of no keypoint if it makes none ahead.
     """
 
     status: TrackingStatus
@@ -54,6 +57,7 @@ class Tracked:
     visible_ids: Ints
     information: Array
     flow_only: Ints = field(default_factory=no_ids)
+    new_ids: Ints = field(default_factory=no_ids)
 
     @property
     def firm(self) -> int:
@@ -87,11 +91,11 @@ def untracked(T_world_camera: Array, features: Features) -> Tracked:
     return Tracked(TrackingStatus.OK, T_world_camera, features, none, none, 0, none, information)
 
 
-def reckoned(tracked: Tracked, T_world_camera: Array, covariance: Array) -> Tracked:
-    """A frame that was lost, at the pose (4, 4) where odometry has led; covariance (6, 6)."""
+def reckoned(tracked: Tracked, T_world_camera: Array, motion: Motion) -> Tracked:
+    """A frame that was lost, at the pose (4, 4) where a motion by odometry has led."""
     begun = untracked(T_world_camera, tracked.features)
     status = TrackingStatus.DEAD_RECKONING
-    information: Array = np.asarray(np.linalg.inv(covariance), float)
+    information: Array = np.asarray(np.linalg.inv(motion.covariance), float)
     return replace(begun, status=status, matches=tracked.matches, information=information)
 
 

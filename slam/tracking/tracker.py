@@ -226,7 +226,7 @@ class Tracker:
         ``max_view_angle_deg`` of the direction it was last seen from. The window grows with the
         keypoint's scale; keypoints of another scale than predicted are not candidates.
         """
-        ids, pixels, z = self._in_view(T_world_camera, ids, landmarks)
+        ids, pixels, z = self.in_view(T_world_camera, ids, landmarks)
         scale = np.maximum(landmarks.extent[ids] / z, 1.0)
         query, train = index.pairs(pixels, radius_px * np.minimum(np.sqrt(scale), 3.0))
         ratio = features.scales[train] / scale[query]
@@ -241,7 +241,7 @@ class Tracker:
         turn = features.angles_rad[matches.train] - landmarks.angles_rad[ids[matches.query]]
         return ids, consistent_rotation(matches, turn, tolerance)
 
-    def _in_view(
+    def in_view(
         self, T_world_camera: Array, ids: Ints, landmarks: LandmarkTable
     ) -> tuple[Ints, Array, Array]:
         """Those of the landmarks that are in view, their pixels (N, 2) and z-depths (N,) in m."""

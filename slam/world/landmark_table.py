@@ -57,6 +57,9 @@ class LandmarkTable:
         replaced_by: (N,) the landmark that this one was fused into, -1 for none.
         in_map, in_graph: (N,) bool.
         row: (N,) row of its appearance, 0 for removed landmarks.
+        spare: (M,) reserved ids that no landmark has got.
+        reserved_only: whether new landmarks get reserved ids alone, since there are copies of this
+            table that have ids of their own from the last one on.
 
     Descriptors, directions, extent, angles, colours and patches are kept for landmarks in the map
     only; those of removed landmarks are zero, and their rows are used again.
@@ -82,6 +85,8 @@ class LandmarkTable:
 
     def __init__(self) -> None:
         self._size = 0
+        self.spare: Ints = np.zeros(0, np.int64)
+        self.reserved_only = False
         self._store = {name: filled(1024, column) for name, column in (_OF_ALL | _ROW).items()}
         self._appearance = AppearanceTable()
         self._make_views()
@@ -89,17 +94,37 @@ class LandmarkTable:
     def __len__(self) -> int:
         return self._size
 
-    def add(self, columns: Arrays) -> Ints:
-        """New landmarks from columns by name; returns their ids (N,)."""
-        first = self._size
-        self.extend_to(first + len(columns["points_world"]))
-        ids = np.arange(first, self._size)
-        self._assign_rows(ids)
+    def add(self, columns: Arrays, ids: Ints | None = None) -> Ints:
+        """New landmarks from columns by name; returns their ids (N,), -1 where none was left.
+
+        They get the ids (N,) that are given, if any; where such an id is -1, one of their own.
+        """
+        count = len(columns["points_world"])
+        ids = np.full(count, -1, np.int64) if ids is None else ids.copy()
+        without = np.flatnonzero(ids < 0)
+        own = self._next_ids(len(without))
+        ids[without[: len(own)]] = own
+        rows = np.flatnonzero(ids >= 0)
+        made = ids[rows]
+        self._assign_rows(made)
         for name, values in columns.items():
-            getattr(self, name)[ids] = values
-        self.in_map[ids] = True
-        self.visible[ids] = self.found[ids] = 1
+            getattr(self, name)[made] = values[rows]
+        self.in_map[made] = True
+        self.visible[made] = self.found[made] = 1
         return ids
+
+    def _next_ids(self, count: int) -> Ints:
+        """Ids (N,) for so many new landmarks, or as many as there are."""
+        if self.reserved_only:
+            ids, self.spare = self.spare[:count], self.spare[count:]
+            return ids
+        self.extend_to(self._size + count)
+        return np.arange(self._size - count, self._size)
+
+    def reserve(self, first: int, end: int, given: Ints) -> None:
+        """Reserve the ids from ``first`` to before ``end``; those (N,) ``given`` are not spare."""
+        self.extend_to(max(end, self._size))
+        self.spare = np.concatenate([self.spare, np.setdiff1d(np.arange(first, end), given)])
 
     def extend_to(self, size: int) -> None:
         """Add rows up to a size, not in the map, to be filled from another table."""
@@ -212,7 +237,7 @@ class LandmarkTable:
         """The landmarks in the map; of removed ones only the number is kept."""
         ids = np.flatnonzero(self.in_map)
         columns = {name: self._rows_of(ids, name) for name in _COLUMNS if name != "in_map"}
-        return {"size": np.array(self._size), "ids": ids, **columns}
+        return {"size": np.array(self._size), "ids": ids, **columns, "spare": self.spare}
 
     def _rows_of(self, ids: Ints, name: str) -> NDArray:
         column = getattr(self, name)
@@ -224,11 +249,12 @@ class LandmarkTable:
 
     def restore(self, state: Arrays) -> None:
         """Become the table of a state; this table must be new. Raises ValueError."""
-        check_ids(state["ids"], int(state["size"]))
+        check_ids(np.concatenate([state["ids"], state["spare"]]), int(state["size"]))
         if (state["replaced_by"] >= 0).any():
             raise ValueError("a landmark of the map that was fused into another")
         self.extend_to(int(state["size"]))
         self._assign_rows(state["ids"])
+        self.spare = state["spare"]
         for name in _COLUMNS:
             getattr(self, name)[state["ids"]] = True if name == "in_map" else state[name]
 

@@ -42,6 +42,13 @@ class MapReader(Protocol):
     def accepts_keyframes(self) -> bool:
         """Whether a keyframe that is inserted now will be worked on."""
 
+    @property
+    def landmarks_ahead(self) -> Ints:
+        """Landmarks (N,) of keyframes that the back end has not worked on yet.
+
+        They are as they were measured, may be of what moves, and may be there twice.
+        """
+
 
 class MapEditor(MapReader, Protocol):
     """A map from which observations of moving things are taken, and to which they come back."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from bmask_slam.features.brisk import Features
 from bmask_slam.features.patch_alignment import SubpixelConfig, cut_patches
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.disk_arrays import DiskRecords
 from bmask_slam.graph.geometry import step_lengths, transform
@@ -125,16 +125,15 @@ class WorldMap:
         keypoints = keypoints[self.landmarks.in_map[keyframe.landmark_ids[keypoints]]]
         return keypoints, keyframe.landmark_ids[keypoints]
 
-    def make_landmarks(self, keyframe: Keyframe, keypoints: Ints, points_world: Array) -> Ints:
-        """Make landmarks at points (N, 3) that keypoints (N,) observe; returns their ids."""
-        ids = self.landmarks.add(
-            {
-                "points_world": points_world,
-                "colours": keyframe.features.colours[keypoints],
-                "host": np.full(len(keypoints), keyframe.id),
-            }
-        )
-        self.attach(keyframe, keypoints, ids)
+    def make_landmarks(
+        self, keyframe: Keyframe, keypoints: Ints, points_world: Array, ids: Ints | None = None
+    ) -> Ints:
+        """Make landmarks at points (N, 3) that keypoints (N,) observe: see `LandmarkTable.add`."""
+        colours = keyframe.features.colours[keypoints]
+        host = np.full(len(keypoints), keyframe.id)
+        columns: Arrays = {"points_world": points_world, "colours": colours, "host": host}
+        ids = self.landmarks.add(columns, ids)
+        self.attach(keyframe, keypoints[ids >= 0], ids[ids >= 0])
         return ids
 
     def attach(self, keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints) -> None:

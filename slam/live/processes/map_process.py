@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from bmask_slam.graph.arrays import no_ids
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import read_arrays, write_arrays
@@ -101,6 +102,7 @@ class MapServer:
 
     def __init__(self, system: SlamSystem, send: Callable[[Any], None], resent: int = 0) -> None:
         self.system = system
+        system.mapper.world.landmarks.reserved_only = True
         self._send = send
         self._resent = resent
         self._deltas = DeltaMaker()
@@ -168,6 +170,7 @@ class MapServer:
             case PruneMask():
                 editor.prune_mask(message.keyframe_id, message.mask.unpacked(), message.widen_px)
             case RestoreObservations():
+                editor.world.landmarks.reserve(*message.reserved, no_ids())
                 back = message.keyframe_id, message.keypoints, message.patches
                 editor.restore_observations(*back)
                 self.send_changes(-1, done=False)
@@ -213,8 +216,10 @@ class MapServer:
             self._deltas.has_features(message.id)
         system = self.system
         if not self._has_reference(message):
-            self.skip_keyframe(LostKeyframe(message.id, NO_KEYFRAME, np.eye(4), message.history))
+            nowhere = message.id, NO_KEYFRAME, np.eye(4)
+            self.skip_keyframe(LostKeyframe(*nowhere, message.history, message.reserved[1]))
             return
+        system.mapper.world.landmarks.reserve(*message.reserved, message.tracked.new_ids)
         self._add_frames(message)
         tracked, segment = self._updated(message)
         no_images = np.zeros((0, 0, 3), np.uint8), np.zeros((0, 0), np.float32)

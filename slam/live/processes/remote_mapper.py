@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from bmask_slam.back_end.map_backend import add_keyframe
 from bmask_slam.events import Event, EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex
-from bmask_slam.graph.arrays import Arrays, Ints, Mask
+from bmask_slam.graph.arrays import Arrays, Ints, Mask, no_ids
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse
@@ -36,7 +37,7 @@ from bmask_slam.live.messages import (
 )
 from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.processes.map_worker import MapWorker
-from bmask_slam.live.replica import apply_delta
+from bmask_slam.live.replica import apply_delta, landmarks_ahead
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.sensing.sensor_fusion import SensorFusion
@@ -59,6 +60,7 @@ class RemoteMapper:
 
     Attributes:
         world: the copy, with the keyframes that the process has not handled yet.
+        camera: of the frames that are tracked.
         history: of every tracked frame.
         places: index of the keyframes' descriptors, for relocalisation.
         events: of tracking and, as they arrive, of the process.
@@ -76,6 +78,7 @@ class RemoteMapper:
         self, camera: Camera, config: SystemConfig, names: tuple[str, ...], place: MapPlace
     ) -> None:
         self.world, self.history = WorldMap(), FrameHistory()
+        self.camera, self._subpixel = camera, config.tracking.subpixel
         self.places = DescriptorIndex(config.loops.index)
         self.events = EventLog()
         self.sensors = SensorFusion(config.sensors, EventLog())  # the process reports
@@ -86,7 +89,7 @@ class RemoteMapper:
         self.objects: MapObjects | None = None
         self.maps_saved: list[MapSaved] = []
         self.extends, self._asked = True, False
-        self._sent_frames = self._saved_keyframes = 0
+        self._sent_frames = self._saved_keyframes = self._owned = 0
         self._pending: set[int] = set()
         self.worker = MapWorker((camera, config, names), self._replacement, place)
 
@@ -110,6 +113,11 @@ class RemoteMapper:
         return self.extends and self.pending < MAX_PENDING and not self.given_up
 
     @property
+    def landmarks_ahead(self) -> Ints:
+        """See ``MapReader``: those that the process's map did not have when it answered last."""
+        return self._owned + np.flatnonzero(self.world.landmarks.in_map[self._owned :])
+
+    @property
     def given_up(self) -> bool:
         """Whether the process died too often to be restarted."""
         return self.worker.given_up
@@ -117,12 +125,14 @@ class RemoteMapper:
     def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
         """Add a tracked frame to the copy as a keyframe, and send it to the process.
 
-        Until the answer comes it observes the tracked landmarks only.
+        Until the answer comes it observes the tracked landmarks only; those of its own that have
+        depth are among ``landmarks_ahead``.
         """
-        reference = self.reference
+        reference, counts = self.reference, self._visibility_counts()
         keyframe = add_keyframe(self.world, frame, tracked, segment)
-        self.world.store_features(keyframe)
         self.world.observe(keyframe, tracked.keypoints, tracked.landmark_ids)
+        new_ids, reserved = landmarks_ahead(self.world, keyframe, self.camera, self._subpixel)
+        self.world.store_features(keyframe)
         self.places.add(keyframe.id, keyframe.features.descriptors)
         self._pending.add(keyframe.id)
         self.send(
@@ -130,11 +140,12 @@ class RemoteMapper:
                 keyframe.id,
                 frame.index,
                 frame.timestamp_s,
-                tracked,
+                replace(tracked, new_ids=new_ids),
                 segment,
                 None if reference is None else (reference.id, reference.T_world_camera),
                 local_ids,
-                self._visibility_counts(),
+                reserved,
+                counts,
                 self._unsent_history(),
                 kept_depth(frame.depth_m if self._has_labels else frame.depth_m[:0]),
             )
@@ -165,7 +176,10 @@ class RemoteMapper:
     def restore_observations(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
         """As ``Mapper.restore_observations``; the map is changed when the answer comes."""
         if len(keypoints):
-            self.send(RestoreObservations(keyframe_id, keypoints, patches))
+            landmarks = self.world.landmarks
+            reserved = len(landmarks), len(landmarks) + len(keypoints)
+            landmarks.reserve(*reserved, no_ids())
+            self.send(RestoreObservations(keyframe_id, keypoints, patches, reserved))
 
     def send(self, message: Any) -> None:
         """Send a message, which is sent again to a new process if this one dies."""
@@ -214,20 +228,6 @@ class RemoteMapper:
                     others.append(message)
         return others
 
-    def wait_until_ready(self, timeout_s: float) -> None:
-        """Wait until the process is ready. Raises InputError if it cannot start."""
-        self.worker.wait_until_ready(timeout_s)
-
-    def wait_for(self, keyframe: Keyframe, timeout_s: float) -> list[Any]:
-        """Wait until a keyframe has landmarks, is lost, or the timeout; returns as ``catch_up``."""
-        others, deadline_s = [], time.monotonic() + timeout_s
-        while len(self.world.observed(keyframe)[1]) == 0 and not self.given_up:
-            left_s = deadline_s - time.monotonic()
-            if left_s <= 0 or self.history.parent(keyframe.id)[0] == NO_KEYFRAME:
-                break
-            others += self.catch_up(min(left_s, 0.05))
-        return others
-
     def finish(self, timeout_s: float, frames: Arrays) -> Path:
         """Let the process optimise a last time and save its state; returns the file's path.
 
@@ -274,7 +274,7 @@ class RemoteMapper:
             self.places.remove(keyframe_id)
         for keyframe_id in sorted(present.keys() - known_ids):
             self.places.add(keyframe_id, present[keyframe_id].features.descriptors)
-        self.changes += 1
+        self.changes, self._owned = self.changes + 1, message.delta.size
         self.loops_closed, self.sensors.newest = message.loops_closed, message.newest
         if not message.done:
             return

@@ -8,9 +8,10 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 
 import faiss
 import numpy as np
@@ -22,7 +23,7 @@ from synthetic_view import CAMERA, PlaneViews, sideways_path
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import inverse
+from bmask_slam.graph.geometry import inverse, se3_exp
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.labelling.results import LandmarkCloud
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
@@ -30,7 +31,6 @@ from bmask_slam.live.messages import NewKeyframe
 from bmask_slam.live.processes import worker
 from bmask_slam.live.processes.map_worker import MAX_CRASHES, MapWorker
 from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
-from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.run_folder.folder import HEALTH
@@ -98,6 +98,38 @@ def test_a_killed_map_process_is_restarted_without_losing_frames(tmp_path) -> No
     assert len(trajectory) == len(FRAMES)
     assert error_m(trajectory.poses_world_camera) < 0.02
     assert (tmp_path / "run" / "map").stat().st_size > 10_000
+
+
+@contextmanager
+def stopped(process: int) -> Iterator[None]:
+    """A process that does not run for a while."""
+    os.kill(process, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(process, signal.SIGCONT)
+
+
+def test_tracking_goes_on_in_new_places_while_the_map_does_not_answer(tmp_path) -> None:
+    """Landmarks of new keyframes are tracked before the map has made them, and are then its own."""
+    x_m = np.linspace(-1.6, 1.6, 33)  # the view is 2.4 m wide
+    views = PlaneViews([se3_exp(np.array([0, 0, 0, x, 0, 0])) for x in x_m])
+    with LiveSlam(CAMERA, None, LiveOptions(tmp_path / "run")) as slam:
+        track_frames(slam, views[:1])
+        wait_for_the_map(slam)
+        remote = slam._system.remote
+        with stopped(slam.processes()["map"]):
+            assert TrackingStatus.LOST not in track_frames(slam, views[1:], waiting=99)
+            assert remote.pending
+            ahead = remote.landmarks_ahead
+        wait_for_the_map(slam)
+        assert slam.health().map_deaths == 0
+        assert len(remote.landmarks_ahead) == 0 < len(ahead)
+        landmarks = remote.world.landmarks  # of the map now; others were fused into these
+        assert len(landmarks.remaining(landmarks.current(ahead))) > 0.7 * len(ahead)
+    found = read_tum(tmp_path / "run" / "trajectory.txt").poses_world_camera
+    np.testing.assert_allclose(found[:, 0, 3], x_m - x_m[0], atol=0.02)
+    np.testing.assert_allclose(found[:, 1:3, 3], 0, atol=0.02)
 
 
 def wait_for_death(slam: LiveSlam, number: int) -> None:
@@ -287,20 +319,3 @@ def test_a_process_that_starts_too_late_is_reported(tmp_path, monkeypatch) -> No
     with pytest.raises(InputError, match="segmenter's process has not begun within 0 s"):
         RemoteSegmenter(SegmenterOptions("none"), tmp_path, policy=RestartPolicy(start_s=0.0))
     assert children() == before
-
-
-def test_masks_that_come_while_a_segment_begins_are_not_lost() -> None:
-    """Tracking waits for the first landmarks; masks of an older segment may come before them."""
-    landmarks: list[int] = []
-
-    def catch_up(_: float) -> list[str]:
-        landmarks.append(7)
-        return ["masks"]
-
-    mapper = SimpleNamespace(
-        world=SimpleNamespace(observed=lambda keyframe: (None, landmarks)),
-        history=SimpleNamespace(parent=lambda number: (number, np.eye(4))),
-        given_up=False,
-        catch_up=catch_up,
-    )
-    assert RemoteMapper.wait_for(mapper, SimpleNamespace(id=3), 60.0) == ["masks"]

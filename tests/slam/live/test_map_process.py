@@ -43,15 +43,20 @@ def keyframe(
 ) -> NewKeyframe:
     T_world_camera = se3_exp(np.array([0, 0, 0, 0.02 * number, 0, 0]))
     frame = render_plane(T_world_camera, number)
+    tracked = untracked(T_world_camera, system.prepare(frame))
+    first, size = len(system.mapper.world.landmarks), len(tracked.features)
+    has_depth = np.isfinite(tracked.features.depth_m)
+    new_ids = np.where(has_depth, first + np.cumsum(has_depth) - 1, -1)
     entries = np.array([(number / 30, number, np.eye(4), UNKNOWN)], ENTRY)
     return NewKeyframe(
         number,
         frame.index,
         frame.timestamp_s,
-        untracked(T_world_camera, system.prepare(frame)),
+        replace(tracked, new_ids=new_ids),
         0,
         reference,
         NO_IDS,
+        (first, first + size),
         visibility or VisibilityCounts(NO_IDS, NO_IDS, NO_IDS),
         entries,
         frame.depth_m[::2, ::2],
@@ -91,7 +96,8 @@ def test_observations_removed_under_a_mask_are_restored() -> None:
     server.handle(3, PruneMask(1, PackedMask.of(mask), 0))
     under = np.flatnonzero(one.masked)
     assert len(under) > 20
-    server.handle(4, RestoreObservations(1, under, all_patches[under]))
+    reserved = (next_id, next_id + len(under))
+    server.handle(4, RestoreObservations(1, under, all_patches[under], reserved))
     assert not one.masked.any()
     back = one.landmark_ids[under]
     with_depth = np.isfinite(one.features.depth_m[under])
@@ -103,7 +109,8 @@ def test_observations_removed_under_a_mask_are_restored() -> None:
     assert np.isfinite(landmarks.patch_views[back[made]][:, 0]).all()
     delta = [answer for answer in answers if isinstance(answer, MapChanged)][-1].delta
     assert np.isin(back[back >= 0], delta.ids).all()
-    server.handle(5, RestoreObservations(7, under, all_patches[under]))  # culled meanwhile
+    gone = RestoreObservations(7, under, all_patches[under], (len(landmarks), len(landmarks) + 9))
+    server.handle(5, gone)  # culled meanwhile
     server.handle(6, keyframe(system, 2, (1, one.T_world_camera)))
     assert list(system.mapper.world.keyframes) == [0, 1, 2]
 

@@ -9,8 +9,14 @@ import pytest
 from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.config.configuration import resolve
-from bmask_slam.graph.geometry import se3_exp
-from bmask_slam.live.replica import COLUMNS, DeltaMaker, apply_delta, digest_rows
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
+from bmask_slam.live.replica import (
+    COLUMNS,
+    DeltaMaker,
+    apply_delta,
+    digest_rows,
+    landmarks_ahead,
+)
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.frame_history import FrameHistory
@@ -90,17 +96,27 @@ def test_keyframes_unknown_to_the_owner_move_with_the_others(followed) -> None:
     apply_delta(DeltaMaker().delta(world, system.mapper.history), copy, history)
     newest = list(copy.keyframes.values())[-1]
     ahead = se3_exp(np.array([0.1, 0, 0, 0.2, 0, 0]))
-    pending = Keyframe(
-        copy.next_keyframe_id, 99, 9.9, 0, newest.T_world_camera @ ahead, newest.features,
-        newest.landmark_ids.copy(),
-    )  # fmt: skip
+    features = system.prepare(render_plane(np.eye(4)))
+    none = np.full(len(features), -1)
+    T_world_pending = newest.T_world_camera @ ahead
+    pending = Keyframe(copy.next_keyframe_id, 99, 9.9, 0, T_world_pending, features, none)
     copy.add_keyframe(pending)
+    ids, reserved = landmarks_ahead(copy, pending, CAMERA, system.config.tracking.subpixel)
+    assert reserved == (len(world.landmarks), len(world.landmarks) + len(features))
+    ids = ids[ids >= 0]
+    assert len(ids) > 100 and (ids >= len(world.landmarks)).all()
+    points_camera = transform(inverse(T_world_pending), copy.landmarks.points_world[ids])
     moved = se3_exp(np.array([0, 0.3, 0, 1.0, -2.0, 0.5]))
     for keyframe in world.keyframes.values():
         keyframe.T_world_camera = moved @ keyframe.T_world_camera
     apply_delta(DeltaMaker().delta(world, system.mapper.history), copy, history)
     expected = world.keyframes[newest.id].T_world_camera @ ahead
     np.testing.assert_allclose(copy.keyframes[pending.id].T_world_camera, expected, atol=1e-12)
+    assert copy.landmarks.in_map[ids].all()
+    points_world = copy.landmarks.points_world[ids]
+    np.testing.assert_allclose(points_world, transform(expected, points_camera), atol=1e-9)
+    equal_rows = copy.landmarks.in_map[: len(world.landmarks)] == world.landmarks.in_map
+    assert equal_rows.all()
     assert copy.next_keyframe_id == pending.id + 1
 
 
@@ -119,7 +135,8 @@ def test_an_owner_restarted_from_an_older_state_is_followed() -> None:
     assert culled and len(pickle.loads(older).in_map) * 8 < size
     apply_delta(pickle.loads(older), copy, history)
     assert len(copy.landmarks) == size
-    assert not copy.landmarks.in_map[pickle.loads(older).size :].any()
+    newer = copy.landmarks.host[pickle.loads(older).size :]  # of landmarks that are sent again
+    assert (newer >= pickle.loads(older).next_keyframe_id).any()
     assert culled < copy.keyframes.keys()
     assert all(history.parent(keyframe_id)[0] == keyframe_id for keyframe_id in culled)
     apply_delta(after.delta(world, frames), copy, history)

@@ -7,12 +7,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from synthetic_view import CAMERA, T_NEW_OLD, add_keyframe, make_features, points_before
+from synthetic_view import (
+    CAMERA,
+    T_NEW_OLD,
+    add_keyframe,
+    make_features,
+    points_before,
+    random_descriptors,
+)
 
 from bmask_slam.events import EventLog
 from bmask_slam.features.brisk import BriskExtractor, FeatureConfig, Features
 from bmask_slam.features.descriptor_index import DescriptorIndex
-from bmask_slam.graph.arrays import Array
+from bmask_slam.features.patch_alignment import SubpixelConfig
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.geometry import se3_exp, se3_log
 from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.sensing.sensor_fusion import SensorFusion
@@ -20,7 +28,7 @@ from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.relocalisation import RelocalisationConfig
 from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, untracked
 from bmask_slam.tracking.rolling_shutter import PreviousPose
-from bmask_slam.tracking.tracker import TrackingConfig
+from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.local_map import LocalMapConfig
 from bmask_slam.world.world_map import WorldMap
@@ -56,6 +64,7 @@ class StillMap:
     sensors: SensorFusion = field(default_factory=lambda: SensorFusion(SensorsConfig(), EventLog()))
     idle: bool = True
     accepts_keyframes: bool = True
+    landmarks_ahead: Ints = field(default_factory=lambda: NO_IDS)
 
 
 def scene(map_reader: StillMap | None = None) -> tuple[CameraTracker, RecordingTracker, Features]:
@@ -172,3 +181,26 @@ def test_a_lost_frame_is_tracked_on_in_the_segment_where_it_is_recognised(
     assert tracked is found
     assert camera_tracker.segment == 3 and camera_tracker.reference is other
     np.testing.assert_array_equal(camera_tracker.local_ids, ids)
+
+
+@pytest.mark.parametrize(("hidden", "used"), [(0, 90), (150, 40)], ids=["ends", "hidden"])
+def test_landmarks_ahead_of_the_map_are_tracked_where_the_map_ends(hidden: int, used: int) -> None:
+    """A frame shows 40 landmarks of the map and 50 ahead of it; others of the map may be hidden.
+
+    Then something is in front of them, and those ahead may be of what moves there.
+    """
+    rng, map_reader = np.random.default_rng(5), StillMap()
+    points = points_before(np.eye(4), 90 + hidden, rng)
+    seen = make_features(np.eye(4), points, random_descriptors(90 + hidden, rng))
+    old = np.concatenate([np.arange(40), np.arange(90, 90 + hidden)])
+    world = map_reader.world
+    keyframe = add_keyframe(world, np.eye(4), seen)
+    world.make_landmarks(keyframe, old, points[old])
+    map_reader.landmarks_ahead = world.make_landmarks(keyframe, np.arange(40, 90), points[40:90])
+    world.observe(keyframe, np.arange(40, 90), -1)
+    tracker = Tracker(CAMERA, TrackingConfig(subpixel=SubpixelConfig(enabled=False)))
+    rules = RelocalisationConfig(), LocalMapConfig(), BriskExtractor(CAMERA, FeatureConfig())
+    camera_tracker = CameraTracker(tracker, map_reader, *rules)
+    camera_tracker.refer_to(keyframe)
+    shown = make_features(np.eye(4), points[:90], seen.descriptors[:90])
+    assert len(camera_tracker.track(shown).landmark_ids) == used

@@ -85,6 +85,37 @@ def test_ids_of_removed_landmarks_are_not_reused() -> None:
     assert len(table.remaining(np.zeros(0, np.int64))) == 0
 
 
+def test_a_table_with_copies_gives_reserved_ids_alone() -> None:
+    table = LandmarkTable()
+    table.reserved_only = True
+    assert table.add(columns(2)).tolist() == [-1, -1]
+    assert len(table) == 0
+    given = np.array([1, -1, 4])
+    table.reserve(0, 6, given)
+    new = columns(3)
+    ids = table.add(new, given)
+    assert ids.tolist() == [1, 0, 4]
+    np.testing.assert_array_equal(table.points_world[ids], new["points_world"])
+    assert np.flatnonzero(table.in_map).tolist() == [0, 1, 4]
+    restored = LandmarkTable()
+    restored.restore(table.state())
+    restored.reserved_only = True
+    for other in (table, restored):
+        more = columns(4)
+        assert other.add(more).tolist() == [2, 3, 5, -1]
+        np.testing.assert_array_equal(other.points_world[[2, 3, 5]], more["points_world"][:3])
+        other.reserve(9, 10, np.zeros(0, np.int64))  # 6 to 8 are of a keyframe that was lost
+        assert other.add(columns(1)).tolist() == [9]
+        assert len(other) == 10
+
+
+def test_an_id_that_is_spare_and_in_the_map_is_refused() -> None:
+    table = LandmarkTable()
+    table.add(columns(3))
+    with pytest.raises(ValueError, match="twice"):
+        LandmarkTable().restore(table.state() | {"spare": np.array([1])})
+
+
 def test_landmarks_move_rigidly_with_their_own_host() -> None:
     """In its host's frame a landmark does not move; other landmarks do not move at all."""
     table = LandmarkTable()
