@@ -10,10 +10,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from repository import ROOT
 
+from benchmarks.cameras.mirrored import CHANGES, write_changed
 from benchmarks.pages import table, written_sections
 from benchmarks.paths import RESULTS
 from benchmarks.scale import day
@@ -24,8 +26,11 @@ from benchmarks.suite import never_lost
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
+from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
 from bmask_slam.run_folder.semantic_files import SavedObject
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
+from bmask_slam.sequences.cameras import read_camera, write_camera
+from bmask_slam.sequences.lists import read_lists
 
 SCRIPTS = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
@@ -172,3 +177,46 @@ def test_a_truth_moves_with_the_depth_that_a_run_straightens() -> None:
     assert centre_in(place, T_world_camera, camera, bend) == pytest.approx(expected.tolist())
     away = T_world_camera @ np.diag([-1, 1, -1, 1.0])  # turned by half a turn
     assert centre_in(place, away, camera, bend) == []
+
+
+def write_recording(folder: Path, camera: Camera) -> Trajectory:
+    """Three images of noise, with stamps that are not evenly spaced, and their poses."""
+    rng, stamps_s = np.random.default_rng(4), np.array([10.0, 10.1, 10.25])
+    for kind in ("rgb", "depth"):
+        (folder / kind).mkdir(parents=True)
+        for k in range(3):
+            image = rng.integers(0, 255, (camera.height, camera.width), dtype=np.uint8)
+            cv2.imwrite(str(folder / kind / f"{k}.png"), image)
+        rows = (f"{stamp:.6f} {kind}/{k}.png\n" for k, stamp in enumerate(stamps_s))
+        (folder / f"{kind}.txt").write_text("".join(rows), encoding="utf-8")
+    truth = Trajectory(stamps_s, np.array([se3_exp(0.1 * rng.normal(size=6)) for _ in range(3)]))
+    write_camera(folder / "camera.yaml", camera)
+    write_tum(folder / "groundtruth.txt", truth)
+    return truth
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_changed_recording_is_one_that_a_camera_could_have_made(name, tmp_path: Path) -> None:
+    """The changed camera sees a flipped point where the flipped image shows what the point is."""
+    change, bent = CHANGES[name], (0.2, -0.6, 0.003, -0.002, 0.7)
+    camera = Camera(64, 48, fx=52.0, fy=51.0, cx=30.2, cy=25.1, distortion=bent)
+    source, out = tmp_path / "source", tmp_path / "out"
+    poses = write_recording(source, camera).poses_world_camera
+    write_changed(source, out, change)
+    changed, truth = read_camera(out / "camera.yaml"), read_tum(out / "groundtruth.txt")
+    sign = np.array([-1.0 if change.left_right else 1.0, -1.0 if change.upside_down else 1.0, 1.0])
+    colour, _ = read_lists(out)
+    np.testing.assert_allclose(colour.timestamps_s, truth.timestamps_s)
+    order = [2, 1, 0] if change.upside_down else [0, 1, 2]
+    assert [file.name for file in colour.files] == [f"{k}.png" for k in order]
+    for k, T_world_changed in zip(order, truth.poses_world_camera, strict=True):
+        point = transform(poses[k], np.array([[0.2, -0.3, 1.5]]))
+        (seen,) = camera.project_distorted(transform(inverse(poses[k]), point))
+        (again,) = changed.project_distorted(transform(inverse(T_world_changed), point * sign))
+        (u, v), (u_again, v_again) = np.rint(seen).astype(int), np.rint(again).astype(int)
+        for kind in ("rgb", "depth"):
+            before, after = (
+                cv2.imread(str(folder / kind / f"{k}.png"), cv2.IMREAD_UNCHANGED)
+                for folder in (source, out)
+            )
+            assert before[v, u] == after[v_again, u_again]
