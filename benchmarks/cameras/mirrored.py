@@ -19,8 +19,9 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.yaml_file import format_yaml, parse_yaml, read_yaml
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
-from bmask_slam.sequences.cameras import read_camera, write_camera
+from bmask_slam.sequences.cameras import format_camera, read_camera
 from bmask_slam.sequences.lists import ImageList, image_name, read_lists
 
 JPEG_QUALITY = 97
@@ -79,7 +80,11 @@ def write_changed(source: Path, out: Path, change: Change) -> None:
         rows = sorted(zip(stamps_s.tolist(), images.files, strict=True))
         text = "".join(f"{stamp:.6f} {image_name(file, source)}\n" for stamp, file in rows)
         (out / name).write_text(text, encoding="utf-8")
-    write_camera(out / "camera.yaml", change.camera(read_camera(source / "camera.yaml")))
+    camera = change.camera(read_camera(source / "camera.yaml"))
+    known = read_yaml(source / "camera.yaml")  # what is not known must not be said
+    text = parse_yaml(format_camera(camera), "camera.yaml")
+    kept = {key: value for key, value in text.items() if key in {*known, "distortion"}}
+    (out / "camera.yaml").write_text(format_yaml(kept), encoding="utf-8")
     truth = change.trajectory(read_tum(source / "groundtruth.txt"), ends_s)
     write_tum(out / "groundtruth.txt", truth)
 

@@ -254,14 +254,14 @@ class CameraTracker:
     def _tracked_in_image(self, features: Features) -> Tracked:
         """The pose by the local map; where that ends, by the landmarks ahead of the map as well."""
         tracked, known, ahead = self._nearby(features), self._local_ids, self._map.landmarks_ahead
-        few = tracked.firm < self._images.config.few_inliers
-        if not few or not len(ahead):
+        enough = self.tracker.config.min_inliers
+        if tracked.firm >= enough or not len(ahead):
             return tracked
         seen, *_ = self.tracker.in_view(self._predicted(), known, self._map.world.landmarks)
         if len(seen) >= len(features):  # it does not end: something is before it, and may move
             return tracked
         self._local_ids = np.concatenate([known, ahead])
-        tracked = more(tracked, self._nearby(features), self.tracker.config.min_inliers)
+        tracked = more(tracked, self._nearby(features), enough)
         self._local_ids = known
         return tracked
 

@@ -183,24 +183,24 @@ def test_a_lost_frame_is_tracked_on_in_the_segment_where_it_is_recognised(
     np.testing.assert_array_equal(camera_tracker.local_ids, ids)
 
 
-@pytest.mark.parametrize(("hidden", "used"), [(0, 90), (150, 40)], ids=["ends", "hidden"])
+@pytest.mark.parametrize(("hidden", "used"), [(0, 75), (150, 25)], ids=["ends", "hidden"])
 def test_landmarks_ahead_of_the_map_are_tracked_where_the_map_ends(hidden: int, used: int) -> None:
-    """A frame shows 40 landmarks of the map and 50 ahead of it; others of the map may be hidden.
+    """A frame shows 25 landmarks of the map and 50 ahead of it; others of the map may be hidden.
 
     Then something is in front of them, and those ahead may be of what moves there.
     """
     rng, map_reader = np.random.default_rng(5), StillMap()
-    points = points_before(np.eye(4), 90 + hidden, rng)
-    seen = make_features(np.eye(4), points, random_descriptors(90 + hidden, rng))
-    old = np.concatenate([np.arange(40), np.arange(90, 90 + hidden)])
+    points = points_before(np.eye(4), 75 + hidden, rng)
+    seen = make_features(np.eye(4), points, random_descriptors(75 + hidden, rng))
+    old = np.concatenate([np.arange(25), np.arange(75, 75 + hidden)])
     world = map_reader.world
     keyframe = add_keyframe(world, np.eye(4), seen)
     world.make_landmarks(keyframe, old, points[old])
-    map_reader.landmarks_ahead = world.make_landmarks(keyframe, np.arange(40, 90), points[40:90])
-    world.observe(keyframe, np.arange(40, 90), -1)
+    map_reader.landmarks_ahead = world.make_landmarks(keyframe, np.arange(25, 75), points[25:75])
+    world.observe(keyframe, np.arange(25, 75), -1)
     tracker = Tracker(CAMERA, TrackingConfig(subpixel=SubpixelConfig(enabled=False)))
     rules = RelocalisationConfig(), LocalMapConfig(), BriskExtractor(CAMERA, FeatureConfig())
     camera_tracker = CameraTracker(tracker, map_reader, *rules)
     camera_tracker.refer_to(keyframe)
-    shown = make_features(np.eye(4), points[:90], seen.descriptors[:90])
+    shown = make_features(np.eye(4), points[:75], seen.descriptors[:75])
     assert len(camera_tracker.track(shown).landmark_ids) == used
