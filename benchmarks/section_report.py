@@ -102,6 +102,7 @@ REPORTS = {
             "live.soak {sequences}/office-300 {sequences}/living_room --minutes 60 "
             "--picture docs/images/live_soak.png",
         ),
+        "turns": ("Fast turns", ""),
         "peak": ("Peak of 600 frames", ""),
         "memory": ("Memory of the map", "live.map_memory ../shared/data/redkitchen --frames 600"),
     }, pictures={
