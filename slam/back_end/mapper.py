@@ -115,10 +115,9 @@ class Mapper:
 
     def begin_session(self) -> None:
         """Clear the frame history, the events and the times; map and graph stay."""
-        self.history = FrameHistory()
+        self.history, self.update_ms = FrameHistory(), []
         self.events.begin_session()
         self.sensors.begin_session(self.world.next_keyframe_id)
-        self.update_ms = []
 
     def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
         """Make a tracked frame a keyframe: landmarks are made, fused and culled."""

@@ -92,6 +92,8 @@ def system() -> SlamSystem:
     system.mapper._factor_selector.remove_landmarks(
         np.array([5, 8])
     )  # none wait between two frames so far
+    landmarks = system.mapper.world.landmarks
+    landmarks.reserve(len(landmarks), len(landmarks) + 3, np.zeros(0, np.int64))
     loops, pairs = system.mapper.loops, np.array([[3, 7], [4, 9]])
     loops.waiting = [
         LoopConstraint(first, second, np.eye(4), np.eye(6), 30 + k, 1.5, pairs[k:])
@@ -281,5 +283,6 @@ def test_compared_classes_have_only_compared_attributes(system: SlamSystem) -> N
     rows = {"of_keyframe", "of_landmark", "_free", "_columns", "_slots", "_used"}
     assert vars(tables.observations).keys() == rows
     columns = table._store.keys() | table._appearance.views(table.row).keys()
-    assert vars(table).keys() == {"_size", "_store", "_appearance", *columns}
-    assert columns - {"in_map", "row"} == table.state().keys() - {"size", "ids"}
+    ids = {"_size", "spare", "reserved_only"}
+    assert vars(table).keys() == {*ids, "_store", "_appearance", *columns}
+    assert columns - {"in_map", "row"} == table.state().keys() - {"size", "ids", "spare"}

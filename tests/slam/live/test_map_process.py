@@ -44,7 +44,7 @@ def keyframe(
     T_world_camera = se3_exp(np.array([0, 0, 0, 0.02 * number, 0, 0]))
     frame = render_plane(T_world_camera, number)
     tracked = untracked(T_world_camera, system.prepare(frame))
-    first, size = len(system.mapper.world.landmarks), len(tracked.features)
+    first, size = 2000 * number, len(tracked.features)
     has_depth = np.isfinite(tracked.features.depth_m)
     new_ids = np.where(has_depth, first + np.cumsum(has_depth) - 1, -1)
     entries = np.array([(number / 30, number, np.eye(4), UNKNOWN)], ENTRY)
