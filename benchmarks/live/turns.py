@@ -31,6 +31,25 @@ def repeat(sequence: Path, out: Path, code: Path | None) -> tuple[int, int, floa
     return lost, int(found["frames_dropped"]), 1e3 * found["ate_rmse"]
 
 
+def inputs_of(source: Path, scratch: Path) -> dict[str, Path]:
+    """A recording and what is made of it, by name; the name tells the kind of camera."""
+    inputs = {source.name: source}
+    for name, change in CHANGES.items():
+        made = scratch / f"{source.name}_{name}"
+        write_changed(source, made, change)
+        inputs[made.name] = made
+    return inputs
+
+
+def line(title: str, repeats: list[tuple[int, int, float]]) -> str:
+    """A line of the table."""
+    lost, dropped, errors = (
+        " ".join(f"{value:.{digits}f}" for value in column)
+        for column, digits in zip(zip(*repeats, strict=True), (0, 0, 1), strict=True)
+    )
+    return f"{title:{NAME}}{lost:>14}{dropped:>14}{errors:>20}"
+
+
 def main() -> None:
     """Print a line for each recording."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -43,24 +62,18 @@ def main() -> None:
         os.sched_setaffinity(0, {given.core})
     codes = {"": None} if given.before is None else {", before": given.before, "": None}
     print(f"{'':{NAME}}{'lost':>14}{'dropped':>14}{'ATE mm':>20}")
-    with tempfile.TemporaryDirectory() as scratch:
-        for source in given.sequences:
-            inputs = {source.name: source}
-            for name, change in CHANGES.items():
-                made = Path(scratch) / f"{source.name}_{name}"  # a name tells the kind of camera
-                write_changed(source, made, change)
-                inputs[made.name] = made
-            for name, sequence in inputs.items():
-                runs: dict[str, list[tuple[int, int, float]]] = {when: [] for when in codes}
-                for _ in range(given.repeats):
-                    for when, code in codes.items():
-                        runs[when].append(repeat(sequence, Path(scratch) / "run", code))
-                for when, repeats in runs.items():
-                    lost, dropped, errors = zip(*repeats, strict=True)
-                    cells = [" ".join(map(str, column)) for column in (lost, dropped)]
-                    cells.append(" ".join(f"{error:.1f}" for error in errors))
-                    title = f"{name}{when}"
-                    print(f"{title:{NAME}}{cells[0]:>14}{cells[1]:>14}{cells[2]:>20}", flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        scratch = Path(folder)
+        sequences = {
+            k: s for source in given.sequences for k, s in inputs_of(source, scratch).items()
+        }
+        for name, sequence in sequences.items():
+            runs: dict[str, list[tuple[int, int, float]]] = {when: [] for when in codes}
+            for _ in range(given.repeats):
+                for when, code in codes.items():
+                    runs[when].append(repeat(sequence, scratch / "run", code))
+            for when, repeats in runs.items():
+                print(line(f"{name}{when}", repeats), flush=True)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.features.patch_alignment import SubpixelConfig
 from bmask_slam.graph.arrays import Array, Arrays, Bits, Bytes, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import carried_along
+from bmask_slam.graph.geometry import carried_along, inverse, transform
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
@@ -206,19 +206,17 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
     that it has made itself, which then stay as ones that are not in the map. It may also have
     keyframes that had been culled.
     """
-    _apply_landmarks(delta, world)
+    ahead = _apply_landmarks(delta, world)
     pending = [k for k in world.keyframes.values() if k.id >= delta.next_keyframe_id]
     shared = [i for i in delta.keyframe_ids.tolist() if i in world.keyframes]
     poses = dict(zip(delta.keyframe_ids.tolist(), delta.poses, strict=True))
     if pending and shared:
         newest = world.keyframes[shared[-1]]
         T_old, T_new = newest.T_world_camera, poses[newest.id]
-        before = np.array([k.T_world_camera for k in pending])
         for keyframe in pending:
             keyframe.T_world_camera = carried_along(keyframe.T_world_camera, T_old, T_new)
-        after = np.array([k.T_world_camera for k in pending])
-        ids = np.flatnonzero(_ahead(delta, world))
-        world.landmarks.move_with_hosts(ids, np.array([k.id for k in pending]), before, after)
+        points_world = world.landmarks.points_world
+        points_world[ahead] = transform(T_new @ inverse(T_old), points_world[ahead])
     segments = dict(zip(delta.keyframe_ids.tolist(), delta.segments.tolist(), strict=True))
     kept = {i: _keyframe(i, delta, world) for i in poses}
     for keyframe in kept.values():
@@ -231,10 +229,13 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
         history.hand_over(keyframe_id, parent, T_parent_culled)
 
 
-def _apply_landmarks(delta: WorldDelta, world: WorldMap) -> None:
+def _apply_landmarks(delta: WorldDelta, world: WorldMap) -> Ints:
+    """Returns the landmarks that were made of keyframes that the owner has not received yet."""
     table = world.landmarks
     table.extend_to(max(delta.size, len(table)))
-    in_map = _ahead(delta, world)
+    in_map = table.in_map & (table.host >= delta.next_keyframe_id)
+    in_map[: delta.size] = in_map[table.spare] = False  # spare ids are the owner's
+    ahead = np.flatnonzero(in_map)
     in_map[: delta.size] = np.unpackbits(delta.in_map, count=delta.size)
     table.set_in_map(in_map)
     table.points_world[delta.moved] = delta.points_world
@@ -243,14 +244,6 @@ def _apply_landmarks(delta: WorldDelta, world: WorldMap) -> None:
     if delta.replaced_by is not None:
         table.replaced_by[: delta.size] = delta.replaced_by
         table.replaced_by[delta.size :] = -1
-
-
-def _ahead(delta: WorldDelta, world: WorldMap) -> Mask:
-    """The landmarks (N,) of the copy that were made of keyframes that the owner has not yet."""
-    table = world.landmarks
-    ahead = table.in_map & (table.host >= delta.next_keyframe_id)
-    ahead[: delta.size] = False
-    ahead[table.spare] = False  # the owner made these
     return ahead
 
 

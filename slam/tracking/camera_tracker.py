@@ -253,37 +253,33 @@ class CameraTracker:
 
     def _tracked_in_image(self, features: Features) -> Tracked:
         """The pose by the local map; where that ends, by the landmarks ahead of the map as well."""
-        tracked, known, ahead = self._nearby(features), self._local_ids, self._map.landmarks_ahead
-        enough = self.tracker.config.min_inliers
-        if tracked.firm >= enough or not len(ahead):
+        known, enough = self._local_ids, self.tracker.config.min_inliers
+        tracked = self._by_landmarks(features, known)
+        if tracked.firm >= enough or not len(ahead := self._map.landmarks_ahead):
             return tracked
         seen, *_ = self.tracker.in_view(self._predicted(), known, self._map.world.landmarks)
         if len(seen) >= len(features):  # it does not end: something is before it, and may move
             return tracked
-        self._local_ids = np.concatenate([known, ahead])
-        tracked = more(tracked, self._nearby(features), enough)
-        self._local_ids = known
-        return tracked
+        return more(tracked, self._by_landmarks(features, np.concatenate([known, ahead])), enough)
 
-    def _nearby(self, features: Features) -> Tracked:
-        """The pose by the local map, with the help of the image's motion where there is need."""
+    def _by_landmarks(self, features: Features, ids: Ints) -> Tracked:
+        """The pose by landmarks (N,), with the help of the image's motion where there is need."""
         enough = self.tracker.config.min_inliers
         if self._images.followed is not None:
-            guided = self._guided(features)
+            guided = self._guided(features, ids)
             if guided.firm >= enough:
                 return guided
-            return more(guided, self._tracked(features, self._local_ids), enough)
-        tracked = self._tracked(features, self._local_ids)
+            return more(guided, self._tracked(features, ids), enough)
+        tracked = self._tracked(features, ids)
         if tracked.firm < self._images.config.few_inliers:
             self._follow(features)
         followed = self._images.followed is not None
-        return more(tracked, self._guided(features), enough) if followed else tracked
+        return more(tracked, self._guided(features, ids), enough) if followed else tracked
 
-    def _guided(self, features: Features) -> Tracked:
-        """The pose by the local map, of which landmarks were followed from the last image."""
-        T, ids, world = self._predicted(), self._local_ids, self._map.world
+    def _guided(self, features: Features, ids: Ints) -> Tracked:
+        """The pose by landmarks (N,), some of which were followed from the last image."""
+        T, world, last = self._predicted(), self._map.world, self._motion.previous(self.lost_frames)
         guided = self._images.guided(features, ids, world.landmarks)
-        last = self._motion.previous(self.lost_frames)
         return self.tracker.refine(features, T, ids, world, last, guided)
 
     def _predicted(self) -> Array:
