@@ -17,6 +17,9 @@ NO_DEPTH_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 MAX_SIDE_PX = 65_535
 LEAST = 1e-9  # smaller focal lengths, scales and rates overflow where they are divided by
 KINECT_DISPARITY_SIGMA_PX = 0.08
+SIDES = ("top", "right", "bottom", "left")
+"""Of an image; the number of right angles that it is turned anticlockwise to have that side up."""
+_DIRECTIONS = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,8 @@ class Camera:
     ``depth_distortion`` is what the sensor adds to the inverse depth, in 1/m: coefficients of
     ``depth_distortion_terms``. Structured light bends its depth images so, by an error of the
     disparity that varies smoothly over the image (Herrera et al., PAMI 34, 2012).
+    ``up`` is the side of the image that is up in the world, one of SIDES, where the camera is
+    mounted sideways or upside down; "": not said.
     """
 
     width: int
@@ -92,10 +97,12 @@ class Camera:
     rolling_shutter_s: float = 0.0
     depth_noise: DepthNoise | None = None
     depth_distortion: tuple[float, float, float, float, float] = NO_DEPTH_DISTORTION
+    up: str = ""
 
     def fault(self) -> str:
         """What no camera can be, in words; "" for a possible camera."""
-        numbers = [getattr(self, f.name) for f in fields(self) if f.name != "depth_noise"]
+        others = ("depth_noise", "up")
+        numbers = [getattr(self, f.name) for f in fields(self) if f.name not in others]
         flat: Array = np.concatenate([np.ravel(number) for number in numbers]).astype(float)
         if not (np.abs(flat) <= MAX_NUMBER).all():
             return "a number that is not finite"
@@ -104,7 +111,7 @@ class Camera:
         if min(self.fx, self.fy, self.depth_scale, self.fps, self.stereo_bf_px_m) < LEAST:
             what = "a focal length, depth scale, rate or stereo_bf"
             return f"{what} that is not positive, or below {LEAST:g}"
-        return ""
+        return "" if self.up in ("", *SIDES) else f"up {self.up!r}, which is no side of an image"
 
     def noise_of_depth(self, disparity_sigma_px: float | None = None) -> DepthNoise:
         """The noise by a constant error of the disparity, if given; else the sensor's own.
@@ -115,6 +122,11 @@ class Camera:
             return self.depth_noise
         sigma_px = KINECT_DISPARITY_SIGMA_PX if disparity_sigma_px is None else disparity_sigma_px
         return DepthNoise.of_disparity(sigma_px, self.stereo_bf_px_m)
+
+    @property
+    def up_camera(self) -> Array:
+        """About up (3,) in the camera's frame: the direction of the side of the image."""
+        return direction_of(self.up)
 
     @property
     def graph_depth_factor(self) -> float:
@@ -257,3 +269,12 @@ def distortion_terms(normalised: Array) -> Array:
     along_x = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x**2, x * r2**3], axis=-1)
     along_y = np.stack([y * r2, y * r2**2, r2 + 2 * y**2, 2 * x * y, y * r2**3], axis=-1)
     return np.stack([along_x, along_y], axis=-2)
+
+
+def direction_of(side: str) -> Array:
+    """The direction (3,) of a side of the image in the camera's frame; of the top for "".
+
+    Raises:
+        ValueError: there is no such side.
+    """
+    return np.array(_DIRECTIONS[SIDES.index(side or SIDES[0])])

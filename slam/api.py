@@ -164,9 +164,10 @@ def make_segmenter(
     """
     from bmask_slam.datasets.weights import find_weights  # noqa: PLC0415
     from bmask_slam.semantics.segmenters import segmenter_table  # noqa: PLC0415
+    from bmask_slam.semantics.segmenters.upright import Upright  # noqa: PLC0415
 
     options = _segmenter_options(segmenter, segmenter_table.SegmenterOptions())
-    return segmenter_table.make_segmenter(options, Path(sequence), find_weights)
+    return segmenter_table.make_segmenter(options, Path(sequence), find_weights, Upright())
 
 
 def _configuration(

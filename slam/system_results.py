@@ -47,7 +47,8 @@ NEWER_ARRAYS = (
 )
 """Beginnings of the names of arrays that older files lack; an empty system's are used then."""
 OPTIONAL_ARRAYS = (
-    *("s.measured", "upright.points", "labels.scores", "labels.seen", "labels.judged"),
+    *("s.measured", "upright.points", "upright.side"),
+    *("labels.scores", "labels.seen", "labels.judged"),
     *("votes.coded", "votes.cell_px", "votes.codes_shape", "votes.codes", "points.covered"),
 )
 """Ends of the names of arrays that older files lack, and whose readers do without."""

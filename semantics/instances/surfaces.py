@@ -108,18 +108,28 @@ class Segmented(list[Instance]):
 
     Attributes:
         surfaces: classes of all pixels; None where the segmenter does not tell.
+        up: the side of the image that is up in the world, of `graph.camera.SIDES`; "" where the
+            segmenter does not know.
     """
 
     def __init__(
-        self, instances: Iterable[Instance] = (), surfaces: SurfaceClasses | None = None
+        self,
+        instances: Iterable[Instance] = (),
+        surfaces: SurfaceClasses | None = None,
+        up: str = "",
     ) -> None:
         super().__init__(instances)
-        self.surfaces = surfaces
+        self.surfaces, self.up = surfaces, up
 
 
 def surfaces_of(instances: object) -> SurfaceClasses | None:
     """What a segmenter told about all pixels with its instances; None for a plain list."""
     return instances.surfaces if isinstance(instances, Segmented) else None
+
+
+def up_of(instances: object) -> str:
+    """The side of an image that its segmenter knows to be up; "" for a plain list."""
+    return instances.up if isinstance(instances, Segmented) else ""
 
 
 def most_probable(seen: SurfaceClasses) -> tuple[Bytes, Floats]:

@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Arrays, Floats
+from bmask_slam.graph.camera import SIDES, direction_of
+
+logger = logging.getLogger(__name__)
 
 _SAMPLES = 64
 _MAX_STEP = 0.05  # relative to the depth
-_UP_CAMERA = np.array([0.0, -1.0, 0.0])
 _UPWARD = np.deg2rad(12)
 _ENOUGH, _LOWEST, _CAMERA_ABOVE_M = 40, 0.03, (0.8, 2.3)
 
 
 class GravityEstimator:
-    """Estimates up and the floor from surface samples, stored in the frames of their keyframes."""
+    """Estimates up and the floor from surface samples, stored in the frames of their keyframes.
 
-    def __init__(self) -> None:
+    ``side`` is the side of the images that is up, of `graph.camera.SIDES`, "" if not known.
+    """
+
+    def __init__(self, side: str = "") -> None:
+        self.side = side
         self._normals: dict[int, Floats] = {}
         self._points: dict[int, Floats] = {}
+
+    def use_side(self, side: str) -> None:
+        """A segmenter has found the side of the images that is up; "" if it has not."""
+        if side and side != self.side:
+            if (self.side or SIDES[0]) != side:
+                logger.info("the %s of the images is up; they are turned for the network", side)
+            self.side = side
 
     def add(self, keyframe_id: int, depth_m: Floats, rays: Array) -> None:
         """Add samples of a depth image (h, w); ``rays`` (h, w, 3) have z = 1."""
@@ -28,10 +43,11 @@ class GravityEstimator:
     def up_world(self, poses: dict[int, Array]) -> Array:
         """The up direction, a unit vector (3,), given T_world_keyframe by keyframe id."""
         known = [k for k in self._normals if k in poses]
+        up_camera = direction_of(self.side)
         if not known:
-            return _UP_CAMERA
+            return up_camera
         normals = [self._normals[k] @ poses[k][:3, :3].T for k in known]
-        ups = np.array([poses[k][:3, :3] @ _UP_CAMERA for k in known])
+        ups = np.array([poses[k][:3, :3] @ up_camera for k in known])
         return up_direction(np.concatenate(normals).astype(float), ups)
 
     def floor_m(self, poses: dict[int, Array], up_world: Array) -> float:
@@ -66,14 +82,17 @@ class GravityEstimator:
             "keyframes": np.array(list(self._normals), np.int64),
             "normals": np.array(rows, np.float32).reshape(-1, _SAMPLES, 3),
             "points": np.array(points, np.float32).reshape(-1, _SAMPLES, 3),
+            "side": np.array([self.side]),
         }
 
     def restore(self, state: Arrays) -> None:
-        """Replace the content by a state; files of older versions have no points."""
+        """Replace the content by a state; files of older versions have no points and no side."""
         keyframes, normals = state["keyframes"].tolist(), state["normals"]
         points = state.get("points", np.full_like(normals, np.nan))
         self._normals = dict(zip(keyframes, normals, strict=True))
         self._points = dict(zip(keyframes, points, strict=True))
+        self.side = str(state.get("side", np.array([self.side]))[0])
+        direction_of(self.side)
 
 
 def sample_surface(depth_m: Floats, rays: Array) -> tuple[Floats, Floats]:

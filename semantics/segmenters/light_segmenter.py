@@ -23,6 +23,8 @@ from bmask_slam.semantics.torch_threads import one_thread
 from bmask_slam.semantics.weights.light_weights import LightNetwork
 from bmask_slam.semantics.weights.stuff_weights import StuffNetwork
 
+SURE_SCORE = 0.3
+
 
 class LightSegmenter:
     """YOLOX-Nano with masks and a class for every pixel, one image at a time.
@@ -79,6 +81,18 @@ class LightSegmenter:
             every = Detections(found, masks, around(found.boxes), ious.clamp(0, 1))
             instances = as_instances(every, size, self._selection.min_score)
             return Segmented(instances, self._surfaces(features, output, factor, size))
+
+    def evidence(self, image: Image) -> float:
+        """The sum of class scores of what is surely in an image (H, W, 3); without masks."""
+        check_image(image, "image")
+        size = (image.shape[0], image.shape[1])
+        with torch.inference_mode(), one_thread():
+            tensor = torch.from_numpy(image).to(self._device).permute(2, 0, 1)
+            padded, factor = self._model.detector.letterboxed(tensor, max(size))
+            output = self._model.detector.detections(self._model.detector.features(padded))
+            boxes, p = decode(output[0], (padded.shape[2], padded.shape[3]))
+            sure = SelectionConfig(SURE_SCORE)
+            return float(select(boxes / factor, p, size, self.labels, sure).scores.sum())
 
     def _selected(
         self, output: Tensor, padded: Tensor, factor: float, size: tuple[int, int]

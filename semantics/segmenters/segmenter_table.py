@@ -18,6 +18,7 @@ from bmask_slam.semantics.segmenters.segmenter import (
     NoSegmenter,
     Segmenter,
 )
+from bmask_slam.semantics.segmenters.upright import Finder, Upright, UprightSegmenter
 
 NAMES = {
     "light": "YOLOX-Nano with masks, with the weights of this project or --weights",
@@ -89,15 +90,27 @@ FindWeights = Callable[[str], Path]
 
 
 def make_segmenter(
-    options: SegmenterOptions, sequence: Path, find_weights: FindWeights = Path
+    options: SegmenterOptions,
+    sequence: Path,
+    find_weights: FindWeights = Path,
+    upright: Upright | None = None,
 ) -> Segmenter:
     """Make the segmenter of ``options.name`` for the images of a folder.
 
     By default ``options.weights`` must be a path. ``find_weights`` must be picklable for Ray.
+    Images are turned ``upright`` for a network; None: they are.
 
     Raises:
         InputError: an unknown name, or a file or class that is missing or does not fit.
     """
+    found = _made(options, sequence, find_weights)
+    if upright is None or not options.is_network:
+        return found
+    return UprightSegmenter(found, upright, None if options.ray else _finder(found))
+
+
+def _made(options: SegmenterOptions, sequence: Path, find_weights: FindWeights) -> Segmenter:
+    """The segmenter for images as they are."""
     own = names_class(options.name)
     if not own and options.name not in NAMES:
         known = f"{', '.join(NAMES)}, or module:Class"
@@ -176,6 +189,16 @@ def _network(options: SegmenterOptions, find_weights: FindWeights) -> Segmenter:
     body = other.model.config.backbone
     _check_kind(options, "light" if body == "mobilenet_v2" else "mask-scoring-rcnn", body)
     return NetworkSegmenter(other, options.min_score, detector)
+
+
+def _finder(segmenter: Segmenter) -> Finder:
+    """What finds the side of an image that is up: the light network, this or the shipped one."""
+    from bmask_slam.semantics.segmenters.light_segmenter import LightSegmenter  # noqa: PLC0415
+    from bmask_slam.semantics.weights.light_weights import SHIPPED, load_light  # noqa: PLC0415
+
+    if isinstance(segmenter, LightSegmenter):
+        return segmenter
+    return LightSegmenter(load_light(data_path(*SHIPPED)))
 
 
 class LabelsOnly(NoSegmenter):

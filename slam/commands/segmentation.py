@@ -44,9 +44,12 @@ def add_segment(commands: Commands) -> None:
 
 def _segment(arguments: argparse.Namespace) -> int:
     from bmask_slam.datasets.weights import find_weights
+    from bmask_slam.labelling.upright_images import samples
     from bmask_slam.runtime.progress import counting_bar
+    from bmask_slam.semantics.instances.image_files import read_colour
     from bmask_slam.semantics.segmenters.mask_cache import CacheOptions, cache_masks
     from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+    from bmask_slam.semantics.segmenters.upright import Upright
     from bmask_slam.sequences.lists import colour_images
 
     source: Path = arguments.source
@@ -55,7 +58,9 @@ def _segment(arguments: argparse.Namespace) -> int:
     cache = CacheOptions(arguments.out, settings, not arguments.no_overlays)
     with counting_bar(arguments.quiet) as progress:
         files = colour_images(source)
-        result = cache_masks(make_segmenter(options, source, find_weights), files, cache, progress)
+        known = Upright(samples=samples(lambda k: read_colour(files[k][1]), len(files)))
+        segmenter = make_segmenter(options, source, find_weights, known)
+        result = cache_masks(segmenter, files, cache, progress)
     text = f"{result.instances} instances in {result.images} images, {result.reused} of them reused"
     text += f"\n{result.broken} broken images were left out" if result.broken else ""
     text += f"\nMasks       {result.file}"

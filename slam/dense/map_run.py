@@ -25,6 +25,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.growing_table import lock_file
 from bmask_slam.graph.whole_file import remove
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
+from bmask_slam.labelling.upright_images import upright_of
 from bmask_slam.mapping.inverse_depth.dense_mapper import WINDOW, DenseKeyframe
 from bmask_slam.run_folder.frame_file import FRAMES as FRAME_TABLE
 from bmask_slam.run_folder.map_file import run_semantics
@@ -33,6 +34,7 @@ from bmask_slam.runtime.prefetch import prepared_ahead
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
+from bmask_slam.semantics.segmenters.upright import Upright
 from bmask_slam.semantics.torch_threads import one_thread
 from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.tracking.results import FrameResult
@@ -178,7 +180,8 @@ def open_fusion(options: MapOptions) -> RunFusion:
     """The fusion of a finished run. Raises InputError as ``map_run``."""
     run = open_run(options.run, options.sequence)
     masks = options.masks or run_semantics(options.run).segmenter
-    segmenter = make_segmenter(masks, run.sequence.folder, find_weights)
+    upright = Upright(run.side) if run.side else upright_of(run.sequence)
+    segmenter = make_segmenter(masks, run.sequence.folder, find_weights, upright)
     return RunFusion(run, segmenter, replace(options, masks=masks))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.camera import Camera, direction_of
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.graph_update import GRAVITY, reference_frame_id
 from bmask_slam.graph.files.array_file import fitting, part
@@ -35,6 +35,7 @@ class SavedMap:
         keyframes: those of its largest segment, oldest first.
         camera: of the images, with distortion.
         labels: the classes of its landmarks; None if the run had no segmenter.
+        side: the side of the images that is up, of `graph.camera.SIDES`; "" if that is not known.
         up_world: (3,) unit vector of these keyframes, by an accelerometer or an IMU in the graph;
             None without.
     """
@@ -44,6 +45,7 @@ class SavedMap:
     keyframes: list[Keyframe]
     camera: Camera
     labels: RunLabels | None = None
+    side: str = ""
     up_world: Array | None = None
 
     def poses(self) -> dict[int, Array]:
@@ -51,11 +53,12 @@ class SavedMap:
         return {k.id: k.T_world_camera for k in self.world.keyframes.values()}
 
     def up_guess(self) -> Array:
-        """About up (3,), a unit vector: by gravity, or the mean upward axis of the images."""
+        """About up (3,), a unit vector: by gravity, or the mean direction of the upper side."""
         if self.up_world is not None:
             return self.up_world
         poses = np.array([k.T_world_camera for k in self.keyframes])
-        up = -np.mean(poses[np.isfinite(poses).all(axis=(1, 2)), :3, 1], axis=0)
+        turns = poses[np.isfinite(poses).all(axis=(1, 2)), :3, :3]
+        up = np.mean(turns @ direction_of(self.side), axis=0)
         return np.asarray(up / np.linalg.norm(up), float)
 
     def label_distributions(self, ids: Ints, names: LabelSet) -> tuple[Array, Mask]:
@@ -118,7 +121,9 @@ def read_saved_map(path: Path) -> SavedMap:
         segment = world.largest_segment()
         labels = saved_labels(part(state, "semantics"), path)
         up_world = _measured_up(part(state, "mapper.graph"), segment)
-    return SavedMap(path, world, world.in_segment(segment), camera, labels, up_world)
+        side = str(state.get("semantics.upright.side", np.array([""]))[0]) or camera.up
+        direction_of(side)
+    return SavedMap(path, world, world.in_segment(segment), camera, labels, side, up_world)
 
 
 def _measured_up(graph: Arrays, segment: int) -> Array | None:

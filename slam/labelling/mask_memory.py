@@ -6,10 +6,15 @@ from dataclasses import replace
 
 from bmask_slam.graph.arrays import Image
 from bmask_slam.semantics.instances.instances import Instance, PackedMask
-from bmask_slam.semantics.instances.surfaces import Segmented, SurfaceClasses, surfaces_of
+from bmask_slam.semantics.instances.surfaces import (
+    Segmented,
+    SurfaceClasses,
+    surfaces_of,
+    up_of,
+)
 from bmask_slam.semantics.segmenters.segmenter import Segmenter, begin_early
 
-_Packed = tuple[list[tuple[Instance, PackedMask]], SurfaceClasses | None]
+_Packed = tuple[list[tuple[Instance, PackedMask]], SurfaceClasses | None, str]
 
 
 class MaskMemory:
@@ -22,8 +27,8 @@ class MaskMemory:
         """The instances in an image; None if they are not known."""
         if self._found is None or name not in self._found:
             return None
-        packed, surfaces = self._found[name]
-        return Segmented([replace(i, mask=mask.unpacked()) for i, mask in packed], surfaces)
+        packed, surfaces, up = self._found[name]
+        return Segmented([replace(i, mask=mask.unpacked()) for i, mask in packed], surfaces, up)
 
     def knows(self, name: str) -> bool:
         """Whether the instances in an image are known."""
@@ -33,7 +38,7 @@ class MaskMemory:
         """Keep the instances in an image."""
         if self._found is not None:
             packed = [(replace(i, mask=i.mask[:0]), PackedMask.of(i.mask)) for i in instances]
-            self._found[name] = packed, surfaces_of(instances)
+            self._found[name] = packed, surfaces_of(instances), up_of(instances)
 
     def forget(self) -> None:
         """Keep nothing any more: no frame is tracked again."""

@@ -30,7 +30,7 @@ from bmask_slam.semantics.beliefs.surface_geometry import Ground
 from bmask_slam.semantics.beliefs.surface_store import SurfaceStore
 from bmask_slam.semantics.beliefs.votes import vote
 from bmask_slam.semantics.instances.instances import Instance
-from bmask_slam.semantics.instances.surfaces import surfaces_of
+from bmask_slam.semantics.instances.surfaces import surfaces_of, up_of
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.objects.gravity import GravityEstimator
 from bmask_slam.semantics.objects.object_map import KeyframeView, ObjectMap, pixel_rays
@@ -125,6 +125,7 @@ class SemanticMapper:
             logger.info("masks of keyframe %d are not used: %s", keyframe_id, refused)
             return Attachment(keyframe_id, len(instances), refused=refused)
         self._done.add(keyframe_id)
+        self._gravity.use_side(up_of(instances))
         nothing = np.full(self._rays.shape[:2], np.nan, np.float32)
         waiting = self._waiting.pop(keyframe_id, _Waiting(np.nan, nothing))
         least, least_of_objects = self.config.least_scores(self.labels.model is not None)
@@ -251,7 +252,7 @@ class SemanticMapper:
         of_objects = LabelStore(len(names), self.config.labels, model, of_objects=True)
         sizes = read_sizes(names)
         self.objects = ObjectMap(self.camera, of_objects, self.config.objects, sizes)
-        self._gravity = GravityEstimator()
+        self._gravity = GravityEstimator(self.camera.up)
         self._done, self._waiting = set(), {}
 
     def _placed(

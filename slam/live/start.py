@@ -22,6 +22,7 @@ from bmask_slam.run_folder.origin import Origin
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+from bmask_slam.semantics.segmenters.upright import Upright
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.viewer.options import ViewOptions
 
@@ -137,7 +138,8 @@ def start_system(
         segmenter, dense, labels = None, None, NoSegmenter.labels
         if masks.name != "none":
             about = masks, options.images or Path()
-            segmenter = RemoteSegmenter(*about, workstation=options.workstation)
+            known = Upright(camera.up)
+            segmenter = RemoteSegmenter(*about, None, options.workstation, known)
             undo.callback(segmenter.close)
             labels = segmenter.labels
         if options.dense and options.out is not None:

@@ -24,8 +24,9 @@ from bmask_slam.graph.extras import import_dense
 from bmask_slam.graph.sensors.streams import read_folder
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps
 from bmask_slam.labelling.mask_memory import MaskMemory, RememberingSegmenter
+from bmask_slam.labelling.upright_images import upright_of
 from bmask_slam.offline.checkpoint import Checkpoint, read_checkpoint
-from bmask_slam.offline.frame_loop import ActiveRun, process_frames
+from bmask_slam.offline.frame_loop import ActiveRun, process_frames, run_indices
 from bmask_slam.offline.map_localisation import MapLocalisation
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.offline.run_end import RunSummary, finish_run
@@ -37,6 +38,7 @@ from bmask_slam.run_folder.open_files import free_run_path
 from bmask_slam.run_folder.origin import Origin
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.runtime.stop_request import StopRequest
+from bmask_slam.semantics.segmenters.upright import Upright
 from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
@@ -213,6 +215,9 @@ def _system_maker(
     The second keeps masks for a run that begins anew, if it may. Raises InputError.
     """
     chosen, folder = options.config.semantics.segmenter, sequence.folder
+    upright = Upright()
+    if chosen.is_network and given is None and not options.localise:
+        upright = upright_of(sequence, run_indices(sequence, options))
     if given is None and options.dense:
         import_dense("--map")
     if given is not None:
@@ -220,7 +225,7 @@ def _system_maker(
     elif options.parallel:
         from bmask_slam.parallel.system import ParallelSystems  # noqa: PLC0415 - if asked for
 
-        with closing(ParallelSystems(chosen, folder)) as systems:
+        with closing(ParallelSystems(chosen, folder, upright)) as systems:
             yield systems, systems.segmenter.memory if systems.segmenter else None
     elif options.localise:
         yield SlamSystem, None
@@ -228,7 +233,7 @@ def _system_maker(
         from bmask_slam.parallel.segmenter_beside import segmenter_of_run  # noqa: PLC0415
 
         masks = MaskMemory()
-        with segmenter_of_run(chosen, folder) as segmenter:
+        with segmenter_of_run(chosen, folder, upright) as segmenter:
             yield partial(SlamSystem, segmenter=RememberingSegmenter(segmenter, masks)), masks
 
 
@@ -242,9 +247,10 @@ def with_sensors(system: System, sequence: Sequence) -> System:
 
 
 def _differing(made: Camera, now: Camera) -> str:
-    """In what two cameras differ, but for the noise of their depth: "fx 525.0 and 517.3, ..."."""
+    """In what two cameras differ, but for noise of depth and mounting: "fx 525.0 and 517.3"."""
     pairs = ((f.name, getattr(made, f.name), getattr(now, f.name)) for f in fields(Camera))
-    return ", ".join(f"{n} {a} and {b}" for n, a, b in pairs if n != "depth_noise" and a != b)
+    others = "depth_noise", "up"
+    return ", ".join(f"{n} {a} and {b}" for n, a, b in pairs if n not in others and a != b)
 
 
 def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSystem) -> System:

@@ -27,6 +27,7 @@ from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+from bmask_slam.semantics.segmenters.upright import Upright
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.world_map import WorldMap
@@ -159,8 +160,8 @@ class LockstepSegmenter(RemoteSegmenter):
         memory: masks of images; those that it knows are not made again.
     """
 
-    def __init__(self, options: SegmenterOptions, sequence: Path) -> None:
-        super().__init__(options, sequence)
+    def __init__(self, options: SegmenterOptions, sequence: Path, upright: Upright) -> None:
+        super().__init__(options, sequence, upright=upright)
         self.memory = MaskMemory()
         self.begin()
 

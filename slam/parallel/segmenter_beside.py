@@ -23,6 +23,7 @@ from bmask_slam.semantics.segmenters.segmenter_table import (
     measured_name,
     needed_by,
 )
+from bmask_slam.semantics.segmenters.upright import Upright
 
 ANSWER_S = 600.0
 """Longest time for an image: a large network on an old processor takes a minute."""
@@ -38,9 +39,11 @@ class SegmenterBeside(RemoteSegmenter):
 
     niceness = 0
 
-    def __init__(self, options: SegmenterOptions, sequence: Path) -> None:
+    def __init__(
+        self, options: SegmenterOptions, sequence: Path, upright: Upright | None = None
+    ) -> None:
         """Start the process, for the images of a sequence. Raises InputError if it cannot start."""
-        super().__init__(options, sequence, RestartPolicy(answer_s=ANSWER_S))
+        super().__init__(options, sequence, RestartPolicy(answer_s=ANSWER_S), upright=upright)
         self.measured = measured_name(options)
         self._begun = 0, ""
         self._reasons: dict[int, str] = {}
@@ -74,14 +77,16 @@ class SegmenterBeside(RemoteSegmenter):
 
 
 @contextmanager
-def segmenter_of_run(options: SegmenterOptions, sequence: Path) -> Iterator[Segmenter]:
+def segmenter_of_run(
+    options: SegmenterOptions, sequence: Path, upright: Upright
+) -> Iterator[Segmenter]:
     """The segmenter of an offline run: a network beside it, where there is a second processor.
 
     Raises InputError.
     """
     if options.is_network and not options.ray and available_cores() > 1:
         check_extra(*needed_by(options))
-        with closing(SegmenterBeside(options, sequence)) as segmenter:
+        with closing(SegmenterBeside(options, sequence, upright)) as segmenter:
             yield segmenter
     else:
-        yield make_segmenter(options, sequence, find_weights)
+        yield make_segmenter(options, sequence, find_weights, upright)

@@ -16,6 +16,7 @@ from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.system import LiveSystem
 from bmask_slam.parallel.lockstep import LockstepMapper, LockstepSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import LabelsOnly, SegmenterOptions
+from bmask_slam.semantics.segmenters.upright import Upright
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
@@ -136,9 +137,10 @@ class ParallelSystems:
         segmenter: None for a run without masks.
     """
 
-    def __init__(self, masks: SegmenterOptions, sequence: Path) -> None:
+    def __init__(self, masks: SegmenterOptions, sequence: Path, upright: Upright) -> None:
         """Start the segmenter, for the images of a sequence. Raises InputError if it cannot."""
-        self.segmenter = None if masks.name == "none" else LockstepSegmenter(masks, sequence)
+        about = masks, sequence, upright
+        self.segmenter = None if masks.name == "none" else LockstepSegmenter(*about)
         self._scratch = tempfile.TemporaryDirectory(
             prefix="bmask-slam-", ignore_cleanup_errors=True
         )

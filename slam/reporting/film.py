@@ -160,8 +160,8 @@ class _Film:
     def pictures(self) -> Iterator[Image]:
         """The pictures (H, W, 3), red first."""
         poses = np.stack([shot.T_world_camera for shot in self._shots])
-        down = poses[:, :3, 1].mean(axis=0)
-        up_world = -down / np.linalg.norm(down) if self._up is None else self._up
+        up = (poses[:, :3, :3] @ self._sequence.camera.up_camera).mean(axis=0)
+        up_world = up / np.linalg.norm(up) if self._up is None else self._up
         cloud = make_cloud(self._shots, self._sequence.camera, self._dense)
         if not len(cloud.first):
             raise InputError(f"{self._run.path}: no depth in the frames; there is nothing to film")

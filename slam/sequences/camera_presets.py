@@ -14,6 +14,21 @@ from pathlib import Path
 from bmask_slam.graph.camera import KINECT_DISPARITY_SIGMA_PX, Camera, DepthNoise
 from bmask_slam.graph.errors import InputError
 
+# TUM RGB-D benchmark, ROS/OpenCV calibrations of the colour cameras; freiburg3's images are
+# published undistorted. freiburg2's depth is stored with 5208 to the metre (its depth images
+# were scaled by 1.035 against the others' 5000 when they were published), as ORB-SLAM2 uses it.
+TUM_CAMERAS = {
+    "freiburg1": Camera(
+        640, 480, 517.306408, 516.469215, 318.643040, 255.313989,
+        distortion=(0.262383, -0.953104, -0.005358, 0.002628, 1.163314), depth_scale=5000.0,
+    ),
+    "freiburg2": Camera(
+        640, 480, 520.908620, 521.007327, 325.141442, 249.701764,
+        distortion=(0.231222, -0.784899, -0.003257, -0.000105, 0.917205), depth_scale=5208.0,
+    ),
+    "freiburg3": Camera(640, 480, 535.4, 539.2, 320.1, 247.6, depth_scale=5000.0),
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class CameraPreset:

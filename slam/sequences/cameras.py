@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.graph.camera import MAX_SIDE_PX, NO_DEPTH_DISTORTION, Camera, DepthNoise
+from bmask_slam.graph.camera import MAX_SIDE_PX, NO_DEPTH_DISTORTION, SIDES, Camera, DepthNoise
 from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.files.yaml_file import format_yaml, read_yaml
 from bmask_slam.graph.whole_file import whole_file, writing
 from bmask_slam.sequences.camera_presets import (
     PRESETS,
+    TUM_CAMERAS,
     completed,
     is_preset,
     nominal_camera,
@@ -24,21 +25,6 @@ from bmask_slam.sequences.camera_presets import (
 )
 
 logger = logging.getLogger(__name__)
-
-# TUM RGB-D benchmark, ROS/OpenCV calibrations of the colour cameras; freiburg3's images are
-# published undistorted. freiburg2's depth is stored with 5208 to the metre (its depth images
-# were scaled by 1.035 against the others' 5000 when they were published), as ORB-SLAM2 uses it.
-TUM_CAMERAS = {
-    "freiburg1": Camera(
-        640, 480, 517.306408, 516.469215, 318.643040, 255.313989,
-        distortion=(0.262383, -0.953104, -0.005358, 0.002628, 1.163314), depth_scale=5000.0,
-    ),
-    "freiburg2": Camera(
-        640, 480, 520.908620, 521.007327, 325.141442, 249.701764,
-        distortion=(0.231222, -0.784899, -0.003257, -0.000105, 0.917205), depth_scale=5208.0,
-    ),
-    "freiburg3": Camera(640, 480, 535.4, 539.2, 320.1, 247.6, depth_scale=5000.0),
-}  # fmt: skip
 
 CAMERA_EXAMPLE = (
     "{width: 640, height: 480, fx: 525.0, fy: 525.0, cx: 319.5, cy: 239.5, "
@@ -53,7 +39,7 @@ OPTIONAL = {
     "rolling_shutter": "rolling_shutter_s",
 }
 """Optional numbers by the name of Camera's attribute."""
-KEYS = (*REQUIRED, "distortion", "depth_noise", "depth_distortion", *OPTIONAL)
+KEYS = (*REQUIRED, "distortion", "depth_noise", "depth_distortion", "up", *OPTIONAL)
 MAX_DEPTH_DISTORTION = 0.2
 """In 1/m: an error of 20 cm at 1 m."""
 LIMITS = {"depth_offset": 1.0, "depth_time_offset": 1.0, "rolling_shutter": 1.0}
@@ -152,8 +138,8 @@ def read_camera(path: Path) -> Camera:
 def _read(path: Path) -> tuple[Camera, set[str]]:
     """The camera of a file, and the keys that the file has."""
     values = _values(path)
-    lists = ("distortion", "depth_noise", "depth_distortion")
-    numbers = {k: _number(path, k, v) for k, v in values.items() if k not in lists}
+    others = ("distortion", "depth_noise", "depth_distortion", "up")
+    numbers = {k: _number(path, k, v) for k, v in values.items() if k not in others}
     _check_range(path, numbers)
     optional = {name: numbers[key] for key, name in OPTIONAL.items() if key in numbers}
     camera = Camera(
@@ -163,6 +149,7 @@ def _read(path: Path) -> tuple[Camera, set[str]]:
         distortion=_distortion(path, values.get("distortion", [0, 0, 0, 0, 0])),
         depth_noise=_depth_noise(path, values["depth_noise"]) if "depth_noise" in values else None,
         depth_distortion=_depth_distortion(path, values.get("depth_distortion", [0, 0, 0, 0, 0])),
+        up=_up(path, values["up"]) if "up" in values else "",
         **optional,
     )
     return camera, set(values)
@@ -210,6 +197,8 @@ def format_camera(camera: Camera, comment: str = "") -> str:
         values["depth_noise"] = sigma if in_graph == 1 else [*sigma, in_graph]
     if any(camera.depth_distortion):
         values["depth_distortion"] = list(camera.depth_distortion)
+    if camera.up:
+        values["up"] = camera.up
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
     lines.append(format_yaml(values).rstrip())
     return "\n".join(lines) + "\n"
@@ -243,6 +232,16 @@ def _check_range(path: Path, numbers: dict[str, float]) -> None:
                 f"{path}: {key} is {numbers[key]:g}, outside the image of {size} "
                 f"{numbers[size]:g}; give the principal point in pixels of this image size"
             )
+
+
+def _up(path: Path, value: object) -> str:
+    """The side of the image that is up in the world."""
+    if value not in SIDES:
+        raise InputError(
+            f"{path}: up is {value!r}; it is the side of the image that is up in the world: "
+            f"{', '.join(SIDES)}; leave it out and the network finds it"
+        )
+    return str(value)
 
 
 def _distortion(path: Path, value: object) -> tuple[float, float, float, float, float]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Floats
+from bmask_slam.graph.arrays import Array, Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences.bags.topics import split_path
@@ -96,11 +96,15 @@ class Sequence:
         return Frame(
             index,
             float(self.pairs.timestamps_s[index]),
-            self.recording.read_rgb(self.pairs.rgb_files[index], self.camera),
+            self.rgb(index),
             depth_m,
             image_name(self.pairs.rgb_files[index], self.folder),
             lag_s,
         )
+
+    def rgb(self, index: int) -> Image:
+        """The colour image (H, W, 3) of a frame. Raises InputError for a broken one."""
+        return self.recording.read_rgb(self.pairs.rgb_files[index], self.camera)
 
     def with_camera(self, camera: Camera) -> Sequence:
         """The same images, paired by another camera's ``depth_time_offset_s``."""

@@ -11,6 +11,7 @@ from bmask_slam.datasets.weights import find_weights
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, nearest_indices
+from bmask_slam.labelling.upright_images import upright_of
 from bmask_slam.run_folder.frame_file import FrameTable
 from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.run_folder.origin import find_sequence
@@ -40,7 +41,8 @@ class ReplayPictures:
             self._sequence = open_sequence(sequence or find_sequence(run))
             folder, options = self._sequence.folder, run_semantics(run).segmenter
             if self._masked:
-                self._segmenter = make_segmenter(options, folder, find_weights)
+                upright = upright_of(self._sequence) if options.is_network else None
+                self._segmenter = make_segmenter(options, folder, find_weights, upright)
         except InputError as error:
             what = "masks" if self._sequence is not None else "images"
             logger.warning("shown without %s: %s", what, error)

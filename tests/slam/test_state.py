@@ -227,7 +227,7 @@ def test_a_state_without_objects_or_what_is_newer_is_restored(system: SlamSystem
     objects = {n: a for n, a in none.items() if n.startswith("semantics.objects.")}
     assert restored({**state, **objects}).semantics.objects.state().keys()
     older = {n: a for n, a in state.items() if not n.endswith(OPTIONAL_ARRAYS)}
-    assert len(older) == len(state) - 13
+    assert len(older) == len(state) - 14
     twin = restored(older)
     for table in ("log_p", "views", "misses"):
         name = f"semantics.labels.{table}"

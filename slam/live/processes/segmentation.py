@@ -19,6 +19,7 @@ from bmask_slam.semantics.segmenters.segmenter_table import (
     labels_of,
     make_segmenter,
 )
+from bmask_slam.semantics.segmenters.upright import Upright
 
 logger = logging.getLogger(__name__)
 
@@ -33,12 +34,13 @@ def serve_segmenter(
     channel: Channel,
     options: SegmenterOptions,
     sequence: Path,
+    upright: Upright,
     waiting: int,
     niceness: int = NICENESS,
 ) -> None:
     """Segment images until the channel ends, the newest first; at most ``waiting`` wait."""
     os.nice(niceness)
-    segmenter = make_segmenter(options, sequence, find_weights)
+    segmenter = make_segmenter(options, sequence, find_weights, upright)
     channel.send(Ready(segmenter.labels.names))
     stack: list[ImageToSegment] = []
     while channel.open or stack:
@@ -75,8 +77,11 @@ class RemoteSegmenter:
         sequence: Path,
         policy: RestartPolicy | None = None,
         workstation: Workstation | None = None,
+        upright: Upright | None = None,
     ) -> None:
         """Start the process and wait until it is ready, unless the workstation is away.
+
+        It finds the side of the images that is up, unless ``upright`` says that or how.
 
         Raises:
             InputError: it cannot start, or only the workstation knows its classes and is away.
@@ -85,7 +90,8 @@ class RemoteSegmenter:
         self.segmentation_ms: list[float] = []
         self._requested: dict[int, ImageToSegment] = {}
         self._most = MAX_WAITING if workstation is None else MAX_KEPT
-        arguments, name = (options, sequence, self._most), "segmenter"
+        known = upright or Upright()
+        arguments, name = (options, sequence, known, self._most), "segmenter"
         self.worker: SupervisedWorker
         if workstation is not None:
             self.worker = DistantWorker(name, arguments, workstation)

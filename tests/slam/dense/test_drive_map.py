@@ -97,7 +97,7 @@ def found_frame(parts: list[Cloud], pitch_deg: float, gravity: Array | None) -> 
         SimpleNamespace(T_world_camera=T) for T in (np.eye(4), np.full((4, 4), np.nan))
     ]
     up_world = None if gravity is None else T_map_world[:3, :3].T @ gravity
-    saved = SavedMap(Path("run"), WorldMap(), keyframes, CAMERA, None, up_world)
+    saved = SavedMap(Path("run"), WorldMap(), keyframes, CAMERA, up_world=up_world)
     found, text = map_frame(saved, dense)
     return found @ inverse(T_map_world), text
 
@@ -142,6 +142,9 @@ def test_a_first_guess_of_up_is_gravity_or_the_mean_of_the_cameras() -> None:
     assert saved.up_guess() == pytest.approx(mean / np.linalg.norm(mean))
     measured = replace(saved, up_world=np.array([1.0, 0.0, 0.0]))
     assert measured.up_guess() == pytest.approx([1.0, 0.0, 0.0])
+    sideways = replace(saved, side="left").up_guess()
+    mean = np.array([-1.0, 0.0, 0.0]) - tilted[:3, 0]
+    assert sideways == pytest.approx(mean / np.linalg.norm(mean))
 
 
 def test_gravity_says_where_up_is() -> None:

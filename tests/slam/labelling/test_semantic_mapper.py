@@ -104,6 +104,21 @@ def test_landmarks_get_the_label_of_their_mask(at_once: SlamSystem) -> None:
     assert estimates(at_once).views.max() > 5
 
 
+def test_the_side_that_a_segmenter_found_to_be_up_is_used_and_kept(tmp_path: Path) -> None:
+    segmenter = Sides(FRAMES)
+    system = SlamSystem(CAMERA, SystemConfig(), segmenter)
+    system.process(FRAMES[0])
+    assert system.objects().up_world == pytest.approx([0, -1, 0], abs=0.02)
+    told = Segmented(segmenter.instances(0), up="right")
+    segmenter.instances = lambda number: told  # type: ignore[method-assign]
+    turned = SlamSystem(CAMERA, SystemConfig(), segmenter)
+    turned.process(FRAMES[0])
+    assert turned.objects().up_world == pytest.approx([1, 0, 0], abs=0.02)
+    again = SlamSystem(CAMERA, SystemConfig(), segmenter)
+    again.restore(turned.state(), tmp_path)
+    assert again.objects().up_world == pytest.approx([1, 0, 0], abs=0.02)
+
+
 def late_system() -> SlamSystem:
     segmenter = Sides(FRAMES, late=True)
     system = SlamSystem(CAMERA, resolve(SystemConfig, None, MANY_KEYFRAMES), segmenter)

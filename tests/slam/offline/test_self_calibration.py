@@ -46,8 +46,10 @@ from bmask_slam.parallel.system import ParallelSystems
 from bmask_slam.run_folder.map_file import read_run
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.instances.surfaces import Segmented, up_of
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
+from bmask_slam.semantics.segmenters.upright import Upright
 from bmask_slam.sequences.cameras import read_camera
 from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system import SlamSystem
@@ -300,7 +302,7 @@ def test_after_the_last_frame_keyframes_get_the_depth_of_the_camera_found(
     third = replace(given, depth_time_offset_s=delay_s / 3)
     sequence, right = open_sequence(late_sweep, camera=third), open_sequence(late_sweep)
     right = right.with_camera(sweep_camera)
-    with closing(ParallelSystems(CONFIG.semantics.segmenter, late_sweep)) as systems:
+    with closing(ParallelSystems(CONFIG.semantics.segmenter, late_sweep, Upright())) as systems:
         system = systems(third, CONFIG) if parallel else SlamSystem(third, CONFIG)
         for frame in sequence.frames(0, FRAMES):
             system.process(frame)
@@ -458,7 +460,8 @@ def test_masks_are_kept_while_the_run_may_begin_anew() -> None:
             self.calls += 1
             mask = np.zeros(image.shape[:2], bool)
             mask[3, 4:9] = True
-            return [Instance(mask, mask_box(mask), 1, certain(1, 2), 1.0, 0.5)]
+            found = [Instance(mask, mask_box(mask), 1, certain(1, 2), 1.0, 0.5)]
+            return Segmented(found, None, "left")
 
     inner, image = Counting(), np.zeros((11, 13, 3), np.uint8)
     memory = MaskMemory()
@@ -467,6 +470,7 @@ def test_masks_are_kept_while_the_run_may_begin_anew() -> None:
     assert inner.calls == 1
     np.testing.assert_array_equal(first[0].mask, again[0].mask)
     assert again[0].mask_score == 0.5 and again[0].label == 1
+    assert up_of(again) == "left"
     camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
     SelfCalibrator(SelfCalibration(camera, camera, settled=True), "auto", memory)
     masks.segment(image, "a.png")

@@ -24,6 +24,7 @@ from bmask_slam.offline.runner import RunOptions, resume, run
 from bmask_slam.parallel.lockstep import LAG, LockstepSegmenter
 from bmask_slam.parallel.system import ParallelSystem
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+from bmask_slam.semantics.segmenters.upright import Upright
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
@@ -147,7 +148,7 @@ def test_masks_are_used_some_frames_later_and_made_once_an_image(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(segmentation, "SupervisedWorker", SlowWorker)
-    segmenter = LockstepSegmenter(SegmenterOptions("light"), Path())
+    segmenter = LockstepSegmenter(SegmenterOptions("light"), Path(), Upright())
     image = np.zeros((2, 2, 3), np.uint8)
     for _ in range(2):  # the run begins anew
         segmenter.begin()

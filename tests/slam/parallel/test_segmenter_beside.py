@@ -18,6 +18,7 @@ from bmask_slam.parallel import segmenter_beside
 from bmask_slam.parallel.segmenter_beside import SegmenterBeside, segmenter_of_run
 from bmask_slam.semantics.instances.surfaces import surfaces_of
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.semantics.segmenters.upright import Upright
 from bmask_slam.system_config import SystemConfig
 
 OPTIONS = SegmenterOptions("light")
@@ -81,7 +82,7 @@ def test_weights_that_are_missing_are_named_as_by_a_segmenter_here(tmp_path: Pat
     options = SegmenterOptions("light", weights=str(tmp_path / "none.pth"))
     with pytest.raises(InputError) as here:
         make_segmenter(options, tmp_path)
-    with pytest.raises(InputError) as there, segmenter_of_run(options, tmp_path):
+    with pytest.raises(InputError) as there, segmenter_of_run(options, tmp_path, Upright()):
         pass
     assert "none.pth" in str(here.value) and str(there.value) == str(here.value)
 

@@ -91,6 +91,7 @@ def test_the_example_in_the_messages_is_valid(tmp_path):
         ({"depth_distortion": "[0, 0, x, 0, 0]"}, "depth_distortion is 'x'; it must be a number"),
         ({"depth_noise": "0.002"}, r"depth_noise is 0.002; write \[a, b, c\]"),
         ({"depth_noise": "[0.1, x, 0]"}, "depth_noise is 'x'"),
+        ({"up": "down"}, "up is 'down'; it is the side of the image .* top, right, bottom, left"),
         ({"focal": "500"}, "unknown key 'focal'; the keys are width"),
         ({"fx": "[1, 2"}, "line 4: .*; write e.g."),
     ],
@@ -222,7 +223,7 @@ def test_a_camera_is_read_as_it_was_written(tmp_path):
     )
     in_graph = replace(camera, depth_noise=DepthNoise(c_per_m=0.002, in_graph=2.0))
     bent = replace(camera, depth_distortion=(0.001, -0.002, 0.0105, 0.02, -0.004))
-    for written in (camera, in_graph, bent, replace(camera, depth_noise=None)):
+    for written in (camera, in_graph, bent, replace(camera, depth_noise=None, up="left")):
         write_file(tmp_path / "camera.yaml", written)
         assert read_camera(tmp_path / "camera.yaml") == written
 
