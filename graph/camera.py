@@ -19,6 +19,7 @@ LEAST = 1e-9  # smaller focal lengths, scales and rates overflow where they are 
 KINECT_DISPARITY_SIGMA_PX = 0.08
 SIDES = ("top", "right", "bottom", "left")
 """Of an image; the number of right angles that it is turned anticlockwise to have that side up."""
+_QUARTER = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0, 0, 1, 0], [0, 0, 0, 1]])
 _DIRECTIONS = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0))
 
 
@@ -127,6 +128,23 @@ class Camera:
     def up_camera(self) -> Array:
         """About up (3,) in the camera's frame: the direction of the side of the image."""
         return direction_of(self.up)
+
+    def turned(self, turns: int) -> tuple[Camera, Array]:
+        """The camera of images turned anticlockwise by right angles, and T_self_turned (4, 4).
+
+        What goes by rows and columns of the sensor, readout and distortion of depth, it has not.
+        """
+        camera, T_self_turned = self, np.eye(4)
+        for _ in range(turns % len(SIDES)):
+            k1, k2, p1, p2, k3 = camera.distortion
+            camera = replace(
+                camera, width=camera.height, height=camera.width, fx=camera.fy, fy=camera.fx,
+                cx=camera.cy, cy=camera.width - 1 - camera.cx, distortion=(k1, k2, -p2, p1, k3),
+            )  # fmt: skip
+            T_self_turned = T_self_turned @ _QUARTER
+        bend = NO_DEPTH_DISTORTION
+        plain = replace(camera, rolling_shutter_s=0.0, depth_distortion=bend, up="")
+        return plain, T_self_turned
 
     @property
     def graph_depth_factor(self) -> float:

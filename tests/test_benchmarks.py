@@ -20,6 +20,7 @@ from benchmarks.pages import table, written_sections
 from benchmarks.paths import RESULTS
 from benchmarks.scale import day
 from benchmarks.section_report import REPORTS
+from benchmarks.semantics.mounted import write_turned
 from benchmarks.semantics.real_rooms import ROOMS, score_objects
 from benchmarks.semantics.room_truth import centre_in, moved
 from benchmarks.suite import never_lost
@@ -213,6 +214,27 @@ def test_a_changed_recording_is_one_that_a_camera_could_have_made(name, tmp_path
         point = transform(poses[k], np.array([[0.2, -0.3, 1.5]]))
         (seen,) = camera.project_distorted(transform(inverse(poses[k]), point))
         (again,) = changed.project_distorted(transform(inverse(T_world_changed), point * sign))
+        (u, v), (u_again, v_again) = np.rint(seen).astype(int), np.rint(again).astype(int)
+        for kind in ("rgb", "depth"):
+            before, after = (
+                cv2.imread(str(folder / kind / f"{k}.png"), cv2.IMREAD_UNCHANGED)
+                for folder in (source, out)
+            )
+            assert before[v, u] == after[v_again, u_again]
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_a_turned_recording_shows_the_same_world(turns: int, tmp_path: Path) -> None:
+    """The turned camera sees a point where the turned image shows it."""
+    camera = Camera(64, 48, fx=52.0, fy=51.0, cx=30.2, cy=25.1, distortion=(0.2, -0.6, 0, 0, 0))
+    source, out = tmp_path / "source", tmp_path / "out"
+    poses = write_recording(source, camera).poses_world_camera
+    write_turned(source, out, turns)
+    turned, truth = read_camera(out / "camera.yaml"), read_tum(out / "groundtruth.txt")
+    for k, T_world_turned in enumerate(truth.poses_world_camera):
+        point = transform(poses[k], np.array([[0.2, -0.3, 1.5]]))
+        (seen,) = camera.project_distorted(transform(inverse(poses[k]), point))
+        (again,) = turned.project_distorted(transform(inverse(T_world_turned), point))
         (u, v), (u_again, v_again) = np.rint(seen).astype(int), np.rint(again).astype(int)
         for kind in ("rgb", "depth"):
             before, after = (

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -31,8 +31,7 @@ from benchmarks.semantics.real_rooms import (
 )
 from benchmarks.semantics.room_truth import read_truth
 from benchmarks.suite.measure import call
-from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.camera import SIDES, Camera
+from bmask_slam.graph.camera import SIDES
 from bmask_slam.graph.files.yaml_file import format_yaml, parse_yaml
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
 from bmask_slam.run_folder.reader import Run
@@ -41,42 +40,29 @@ from bmask_slam.sequences.cameras import format_camera, read_camera
 from bmask_slam.sequences.lists import image_name, read_lists
 
 ROOMS = ("redkitchen", "bonn_crowd")
-TURNED = np.array([[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0, 0, 1, 0], [0, 0, 0, 1]])
-"""p_turned = TURNED @ p: the camera's frame after a turn of the image, anticlockwise."""
-
-
-def turned_camera(camera: Camera) -> Camera:
-    """The camera of images that are turned anticlockwise by a right angle."""
-    k1, k2, p1, p2, k3 = camera.distortion
-    return replace(
-        camera,
-        width=camera.height, height=camera.width, fx=camera.fy, fy=camera.fx,
-        cx=camera.cy, cy=camera.width - 1 - camera.cx, distortion=(k1, k2, -p2, p1, k3),
-    )  # fmt: skip
 
 
 def write_turned(source: Path, out: Path, turns: int) -> None:
     """Write a TUM folder with a groundtruth.txt, turned anticlockwise by right angles."""
     for name, images in zip(("rgb.txt", "depth.txt"), read_lists(source), strict=True):
-        pairs = [(file, out / image_name(file, source)) for file in images.files]
+        targets = [out / image_name(file, source) for file in images.files]
         with ThreadPoolExecutor(2) as pool:
-            list(pool.map(lambda pair: _turn_image(*pair, turns), pairs))
+            list(pool.map(partial(_turn_image, turns), images.files, targets))
         lines = zip(images.timestamps_s.tolist(), images.files, strict=True)
         text = "".join(f"{stamp:.6f} {image_name(file, source)}\n" for stamp, file in lines)
         (out / name).write_text(text, encoding="utf-8")
     camera, preset = read_camera(source / "camera.yaml"), preset_of_folder(source)
     readout_s = PRESETS[preset].rolling_shutter_s if preset else 0.0
     poses = read_tum(source / "groundtruth.txt")
-    T_world_camera: Array = poses.poses_world_camera
-    for _ in range(turns):
-        camera, T_world_camera = turned_camera(camera), T_world_camera @ TURNED.T
+    camera, T_camera_turned = camera.turned(turns)
+    T_world_camera = poses.poses_world_camera @ T_camera_turned
     text = parse_yaml(format_camera(camera), "camera.yaml")
     text["rolling_shutter"] = -(readout_s or 0.0) if turns == 2 else 0.0
     (out / "camera.yaml").write_text(format_yaml(text), encoding="utf-8")
     write_tum(out / "groundtruth.txt", Trajectory(poses.timestamps_s, T_world_camera))
 
 
-def _turn_image(source: Path, out: Path, turns: int) -> None:
+def _turn_image(turns: int, source: Path, out: Path) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     image = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
     assert image is not None, f"{source}: no image"

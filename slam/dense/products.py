@@ -11,42 +11,28 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from bmask_slam.dense.surface import FusedMap, frames_a_keyframe, make_surface
-from bmask_slam.graph.arrays import Array, Floats, Ints
-from bmask_slam.graph.camera import Camera
+from bmask_slam.dense.views import VIEWS, write_mesh_view, write_views
+from bmask_slam.graph.arrays import Floats, Ints
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import fitting
 from bmask_slam.graph.files.file_names import file_stem
-from bmask_slam.graph.geometry import make_pose
 from bmask_slam.graph.whole_file import remove
 from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.cloud_files import CloudWriter
 from bmask_slam.mapping.products.floor_plan import FloorPlan, plan_frame, up_direction
 from bmask_slam.mapping.products.mesh_files import write_glb, write_mesh
 from bmask_slam.mapping.products.object_clouds import ObjectClouds, ObjectRegion
-from bmask_slam.mapping.products.pictures import (
-    nearest_points,
-    painted,
-    palette,
-    with_legend,
-    write_picture,
-)
+from bmask_slam.mapping.products.pictures import palette, write_picture
 from bmask_slam.mapping.products.surface_labels import LabelledView, LabelTable, rows_seen, views_of
 from bmask_slam.mapping.products.surface_regions import StuffFusion
 from bmask_slam.mapping.surface.extraction import Surface
 from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.run_folder.semantic_files import OBJECTS, read_objects
 from bmask_slam.semantics.beliefs.surface_geometry import FLOORS, Ground, find_ground
-from bmask_slam.world.keyframe import Keyframe
 
 PLAN_CELL_M, SAMPLE_STEP = 0.03, 20
-AMBIENT = 0.3
-"""Light from everywhere in the picture of the mesh; the rest comes from the camera."""
 AT_ONCE = 50_000
 NO_PIXELS = np.zeros((0, 0), np.uint16)
-OVERVIEW_OFFSET_M = np.array([0.0, -0.6, -1.0])
-OVERVIEW_TILT_DEG = -20.0
-"""The overview is taken from behind and above a keyframe, tilted down."""
-VIEWS = ("first", "middle", "overview")
 CLOUDS = ("semantic.ply", "semantic.pcd", "moving.ply", "moving.pcd")
 OF_SURFACE = (
     *("mesh.ply", "mesh.glb", "view_mesh.png", "plan.png"),
@@ -115,7 +101,7 @@ def write_products(
         plan.add(cloud)
         path_world = np.stack([k.T_world_camera[:3, 3] for k in evidence.keyframes])
         written.append(write_picture(folder.path / "plan.png", plan.picture(path_world)))
-    written += _write_pictures(fused, cloud, names)
+    written += write_views(fused, cloud, names)
     written += _write_excluded(fused, evidence, table)
     for name in {*CLOUDS, *OF_SURFACE * changed} - {path.name for path in written}:
         remove(folder.path / name)
@@ -256,44 +242,11 @@ def _regions(fused: FusedMap) -> list[ObjectRegion]:
 
 
 def _write_mesh(fused: FusedMap, cloud: Cloud, triangles: Ints) -> list[Path]:
-    """Write the mesh, for viewers too, and a picture of it in its colours, lit from the camera."""
+    """Write the mesh, for viewers too, and a picture of it."""
     up_world = up_direction(cloud.normals[::SAMPLE_STEP].astype(float), fused.run.up_guess())
-    path, T_world_camera = fused.folder.path, _middle(fused.keyframes())
-    point_m = 1.6 * fused.options.surface_voxel_m  # no gaps in what is seen aslant
-    seen = nearest_points(cloud.points, fused.run.camera, T_world_camera, point_m)
-    lit = np.abs(cloud.normals @ T_world_camera[:3, 2].astype(np.float32))[:, None]
-    shaded = cloud.colours * (AMBIENT + (1 - AMBIENT) * lit)
-    image = painted(seen, shaded.astype(np.uint8))
+    path = fused.folder.path
     return [
         write_mesh(path / "mesh.ply", cloud, triangles),
         write_glb(path / "mesh.glb", cloud, triangles, up_world),
-        write_picture(path / "view_mesh.png", image),
+        write_mesh_view(fused, cloud),
     ]
-
-
-def _write_pictures(fused: FusedMap, cloud: Cloud, names: tuple[str, ...]) -> list[Path]:
-    """Write view_NAME.png, and view_NAME_semantic.png if there are several labels."""
-    folder, written = fused.folder.path, []
-    present, colours = np.unique(cloud.labels).tolist(), palette(names)
-    for name, (camera, T) in _viewpoints(fused.run.camera, fused.keyframes()).items():
-        seen = nearest_points(cloud.points, camera, T, fused.options.surface_voxel_m)
-        image = painted(seen, cloud.colours)
-        written.append(write_picture(folder / f"view_{name}.png", image))
-        if len(present) > 1:
-            image = with_legend(painted(seen, colours[cloud.labels]), names, present)
-            written.append(write_picture(folder / f"view_{name}_semantic.png", image))
-    return written
-
-
-def _middle(keyframes: list[Keyframe]) -> Array:
-    return keyframes[len(keyframes) // 2].T_world_camera
-
-
-def _viewpoints(camera: Camera, keyframes: list[Keyframe]) -> dict[str, tuple[Camera, Array]]:
-    """Camera and T_world_camera (4, 4) of two keyframes, and of an overview, by name."""
-    first, middle = keyframes[0].T_world_camera, _middle(keyframes)
-    tilt = np.deg2rad(OVERVIEW_TILT_DEG)
-    T_middle_overview = make_pose(np.eye(3), OVERVIEW_OFFSET_M)
-    T_middle_overview[1:3, 1:3] = [[np.cos(tilt), -np.sin(tilt)], [np.sin(tilt), np.cos(tilt)]]
-    overview = middle @ T_middle_overview
-    return {name: (camera, T) for name, T in zip(VIEWS, (first, middle, overview), strict=True)}

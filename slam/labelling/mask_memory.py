@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from bmask_slam.graph.arrays import Image
 from bmask_slam.semantics.instances.instances import Instance, PackedMask
 from bmask_slam.semantics.instances.surfaces import (
@@ -37,7 +39,8 @@ class MaskMemory:
     def keep(self, name: str, instances: list[Instance]) -> None:
         """Keep the instances in an image."""
         if self._found is not None:
-            packed = [(replace(i, mask=i.mask[:0]), PackedMask.of(i.mask)) for i in instances]
+            nothing = np.zeros((0, 0), bool)  # no part of the mask, which would keep all of it
+            packed = [(replace(i, mask=nothing), PackedMask.of(i.mask)) for i in instances]
             self._found[name] = packed, surfaces_of(instances), up_of(instances)
 
     def forget(self) -> None:

@@ -6,7 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from bmask_slam.graph.camera import Camera, DepthNoise, distort_normalised, distortion_terms
+from bmask_slam.graph.camera import (
+    SIDES,
+    Camera,
+    DepthNoise,
+    distort_normalised,
+    distortion_terms,
+)
 
 CAMERA = Camera(640, 480, fx=525.0, fy=510.0, cx=318.5, cy=241.5, stereo_bf_px_m=40.0)
 FREIBURG1 = Camera(
@@ -143,3 +149,28 @@ def test_the_noise_set_by_hand_wins_over_the_sensors_and_that_over_a_kinects() -
     assert camera.noise_of_depth() == own
     assert camera.noise_of_depth(0.2) == DepthNoise(c_per_m=0.2 / 40.0)
     assert CAMERA.noise_of_depth() == DepthNoise(c_per_m=0.08 / 40.0)
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3, 5])
+def test_a_turned_camera_sees_the_turned_image(turns: int) -> None:
+    turned, T_camera_turned = FREIBURG1.turned(turns)
+    ahead = POINTS * [0.2, 0.2, 1.0]
+    expected = FREIBURG1.project_distorted(ahead)
+    size = np.array([FREIBURG1.width, FREIBURG1.height])
+    for _ in range(turns):
+        expected = np.stack([expected[:, 1], size[0] - 1 - expected[:, 0]], axis=1)
+        size = size[::-1]
+    assert (turned.width, turned.height) == tuple(size)
+    found = turned.project_distorted(ahead @ T_camera_turned[:3, :3])
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_turned_by_its_side_a_camera_has_up_at_the_top(side: str) -> None:
+    _, T_camera_turned = CAMERA.turned(SIDES.index(side))
+    camera = dataclasses.replace(CAMERA, up=side)
+    assert (camera.up_camera @ T_camera_turned[:3, :3]).tolist() == [0, -1, 0]
+    assert (
+        dataclasses.replace(CAMERA, up="above").fault()
+        == "up 'above', which is no side of an image"
+    )

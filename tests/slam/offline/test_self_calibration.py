@@ -471,6 +471,9 @@ def test_masks_are_kept_while_the_run_may_begin_anew() -> None:
     np.testing.assert_array_equal(first[0].mask, again[0].mask)
     assert again[0].mask_score == 0.5 and again[0].label == 1
     assert up_of(again) == "left"
+    assert memory._found is not None
+    packed = memory._found["a.png"][0]
+    assert all(i.mask.base is None and i.mask.size == 0 for i, _ in packed)  # keeps no whole mask
     camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
     SelfCalibrator(SelfCalibration(camera, camera, settled=True), "auto", memory)
     masks.segment(image, "a.png")
