@@ -126,6 +126,10 @@ REPORTS = {
             "Labels and objects of real rooms, judged by eye",
             "semantics.real_rooms --out {sequences}/rooms",
         ),
+        "mounted": (
+            "A camera mounted sideways or upside down",
+            "semantics.mounted --out {sequences}/mounted",
+        ),
         "surfaces": (
             "Surfaces of real rooms, judged by eye",
             "semantics.room_surfaces {sequences}/rooms/redkitchen {sequences}/rooms/bonn_crowd",
