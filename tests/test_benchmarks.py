@@ -16,6 +16,8 @@ import pytest
 from repository import ROOT
 
 from benchmarks.cameras.mirrored import CHANGES, write_changed
+from benchmarks.cameras.orb_slam3 import settings_of
+from benchmarks.cameras.orb_vocabulary import lines_of, nearest
 from benchmarks.pages import table, written_sections
 from benchmarks.paths import RESULTS
 from benchmarks.scale import day
@@ -242,3 +244,41 @@ def test_a_turned_recording_shows_the_same_world(turns: int, tmp_path: Path) -> 
                 for folder in (source, out)
             )
             assert before[v, u] == after[v_again, u_again]
+
+
+def test_a_vocabulary_is_a_tree_that_orb_slam_can_read() -> None:
+    """Parents come before children, each has ten at most, and every descriptor reaches a word."""
+    rng = np.random.default_rng(4)
+    centres = rng.integers(0, 256, (40, 32), dtype=np.uint8)
+    owners = np.arange(2000) % 50
+    flips = np.packbits(rng.random((2000, 256)) < 0.03, axis=1)
+    descriptors = centres[rng.integers(0, 40, 2000)] ^ flips
+    first, *lines = lines_of(descriptors, owners)
+    assert first == "10 6 0 0"
+    rows = [line.split(" ") for line in lines]
+    parents = np.array([int(row[0]) for row in rows])
+    words = np.array([row[1] == "1" for row in rows])
+    assert all(len(row) == 2 + 32 + 1 for row in rows)
+    assert (parents < np.arange(1, len(rows) + 1)).all()
+    assert np.bincount(parents).max() <= 10
+    assert not words[parents[parents > 0] - 1].any()
+    weights = np.array([float(row[-1]) for row in rows])
+    assert (weights[words] >= 0).all() and (weights[~words] == 0).all()
+    values = np.array([row[2:34] for row in rows], int).astype(np.uint8)
+    for descriptor in descriptors[:20]:
+        node = 0
+        while node == 0 or not words[node - 1]:
+            below = np.flatnonzero(parents == node)
+            node = int(below[nearest(descriptor[None], values[below])[0]]) + 1
+        differing = np.unpackbits(descriptor ^ values[node - 1]).sum()
+        assert differing < 60  # another centre's differ by about 128
+
+
+def test_orb_slam3_gets_the_camera_in_its_own_format() -> None:
+    camera = Camera(640, 480, fx=520.0, fy=521.5, cx=318, cy=240, distortion=(0.1, -0.2, 0, 0, 0.3))
+    lines = dict(line.split(": ", 1) for line in settings_of(camera).splitlines()[1:])
+    assert lines["Camera1.fx"] == "520.000000000"
+    assert lines["Camera1.cx"] == "318.000000000"
+    assert lines["Camera1.k3"] == "0.300000000"
+    assert (lines["Camera.width"], lines["Camera.fps"]) == ("640", "30")
+    assert float(lines["Stereo.b"]) == pytest.approx(camera.stereo_bf_px_m / camera.fx)

@@ -178,16 +178,20 @@ def track(method: str, folder: Path, out: Path, max_frames: int | None) -> None:
 
 def in_its_own_process(method: str, folder: Path, out: Path, wheels: Path) -> None:
     """Track a sequence in a process that finds the wheel of the method, fetched if missing."""
+    command = [MODULE, method, str(folder.resolve()), "--out", str(out.resolve())]
+    call_with_wheel(command, WHEELS.get(method), wheels.resolve() / method)
+
+
+def call_with_wheel(command: list[str], wheel: str | None, target: Path) -> None:
+    """Run a module in a process that finds a wheel in a folder, fetched there if missing."""
     environment = dict(os.environ)
-    if method in WHEELS:
-        target = wheels.resolve() / method
+    if wheel is not None:
         if not target.is_dir():
             pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target"]
-            subprocess.run([*pip, str(target), WHEELS[method]], check=True)
+            subprocess.run([*pip, str(target), wheel], check=True)
         found = [str(target), environment.get("PYTHONPATH", "")]
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, found))
-    command = ["-m", MODULE, method, str(folder.resolve()), "--out", str(out.resolve())]
-    whole = [sys.executable, *command]
+    whole = [sys.executable, "-m", *command]
     done = subprocess.run(
         whole, cwd=ROOT, env=environment, check=False, capture_output=True, text=True
     )
