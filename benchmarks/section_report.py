@@ -195,10 +195,11 @@ REPORTS = {
         "table": ("Real sequences", "cameras.real_sequences --work {sequences}"),
         "reading": ("What the figures say", ""),
         "parallel": ("In one process or three", ""),
+        "orb": ("Hard inputs beside ORB-SLAM3", ""),
         "hard": ("Hard inputs: never lost", ""),
         "loops": ("Loop closures", "loops.loop_edges --work {sequences}"),
         "wrong": ("Wrong cameras", "suite.wrong_cameras"),
-    }, markdown=frozenset({"table", "hard", "loops", "wrong"})),
+    }, markdown=frozenset({"table", "orb", "hard", "loops", "wrong"})),
 }  # fmt: skip
 
 

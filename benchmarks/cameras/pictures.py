@@ -20,7 +20,7 @@ from bmask_slam.graph.metrics import AbsoluteError, absolute_error
 from bmask_slam.graph.trajectory import Trajectory, associate, read_tum
 
 STATUS_COLOURS = {"WEAK": "#e8b54a", "LOST": "#8a2be2"}
-OTHER_COLOURS = ("#d9541e", "#3a8f4d", "#7fbf7b", "#5b5b9f", "#9e9ac8")
+OTHER_COLOURS = ("#1f77b4", "#3a8f4d", "#7fbf7b", "#5b5b9f", "#9e9ac8")
 FLOOR_MM = 0.1
 LEGEND_SHARE = 0.3
 """Room above the curves, of their height."""
