@@ -47,7 +47,7 @@ NEWER_ARRAYS = (
 )
 """Beginnings of the names of arrays that older files lack; an empty system's are used then."""
 OPTIONAL_ARRAYS = (
-    *("s.measured", "upright.points", "upright.side"),
+    *("s.measured", "upright.points", "upright.sides"),
     *("labels.scores", "labels.seen", "labels.judged"),
     *("votes.coded", "votes.cell_px", "votes.codes_shape", "votes.codes", "points.covered"),
 )

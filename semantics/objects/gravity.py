@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
+from collections.abc import Iterable
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Arrays, Floats
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
 from bmask_slam.graph.camera import SIDES, direction_of
 
 logger = logging.getLogger(__name__)
@@ -20,11 +22,13 @@ _ENOUGH, _LOWEST, _CAMERA_ABOVE_M = 40, 0.03, (0.8, 2.3)
 class GravityEstimator:
     """Estimates up and the floor from surface samples, stored in the frames of their keyframes.
 
-    ``side`` is the side of the images that is up, of `graph.camera.SIDES`, "" if not known.
+    ``side`` is the side of new keyframes' images that is up, of `graph.camera.SIDES`, "" if that is
+    not known; each keyframe keeps its own.
     """
 
     def __init__(self, side: str = "") -> None:
         self.side = side
+        self._sides: dict[int, str] = {}
         self._normals: dict[int, Floats] = {}
         self._points: dict[int, Floats] = {}
 
@@ -34,20 +38,21 @@ class GravityEstimator:
             if (self.side or SIDES[0]) != side:
                 logger.info("the %s of the images is up; they are turned for the network", side)
             self.side = side
+            self._sides = {k: known or side for k, known in self._sides.items()}
 
     def add(self, keyframe_id: int, depth_m: Floats, rays: Array) -> None:
         """Add samples of a depth image (h, w); ``rays`` (h, w, 3) have z = 1."""
         found = sample_surface(depth_m, rays)
         self._points[keyframe_id], self._normals[keyframe_id] = found
+        self._sides[keyframe_id] = self.side
 
     def up_world(self, poses: dict[int, Array]) -> Array:
         """The up direction, a unit vector (3,), given T_world_keyframe by keyframe id."""
         known = [k for k in self._normals if k in poses]
-        up_camera = direction_of(self.side)
         if not known:
-            return up_camera
+            return direction_of(self.side)
         normals = [self._normals[k] @ poses[k][:3, :3].T for k in known]
-        ups = np.array([poses[k][:3, :3] @ up_camera for k in known])
+        ups = np.array([poses[k][:3, :3] @ direction_of(self._sides[k]) for k in known])
         return up_direction(np.concatenate(normals).astype(float), ups)
 
     def floor_m(self, poses: dict[int, Array], up_world: Array) -> float:
@@ -74,6 +79,7 @@ class GravityEstimator:
         """Drop all other keyframes."""
         self._normals = {k: n for k, n in self._normals.items() if k in keyframe_ids}
         self._points = {k: p for k, p in self._points.items() if k in keyframe_ids}
+        self._sides = {k: s for k, s in self._sides.items() if k in keyframe_ids}
 
     def state(self) -> Arrays:
         """The normals as named arrays."""
@@ -82,17 +88,40 @@ class GravityEstimator:
             "keyframes": np.array(list(self._normals), np.int64),
             "normals": np.array(rows, np.float32).reshape(-1, _SAMPLES, 3),
             "points": np.array(points, np.float32).reshape(-1, _SAMPLES, 3),
-            "side": np.array([self.side]),
+            "sides": np.array([("", *SIDES).index(s) for s in self._sides.values()], np.int64),
         }
 
     def restore(self, state: Arrays) -> None:
-        """Replace the content by a state; files of older versions have no points and no side."""
+        """Replace the content by a state; files of older versions have no points and no sides.
+
+        Raises:
+            ValueError: a number of a side that there is not.
+        """
         keyframes, normals = state["keyframes"].tolist(), state["normals"]
         points = state.get("points", np.full_like(normals, np.nan))
         self._normals = dict(zip(keyframes, normals, strict=True))
         self._points = dict(zip(keyframes, points, strict=True))
-        self.side = str(state.get("side", np.array([self.side]))[0])
-        direction_of(self.side)
+        sides = sides_of(state.get("sides", np.zeros(len(keyframes), np.int64)))
+        self._sides = dict(zip(keyframes, sides, strict=True))
+        self.side = most_common(sides) or self.side
+
+
+def sides_of(codes: Ints) -> list[str]:
+    """Sides of images by their numbers (N,) in a state: 0 is not known.
+
+    Raises:
+        ValueError: there is no such side.
+    """
+    names = ("", *SIDES)
+    if len(codes) and not 0 <= codes.min() <= codes.max() < len(names):
+        raise ValueError(f"sides of images are 0 to {len(names) - 1}, found {codes.max()}")
+    return [names[code] for code in codes.tolist()]
+
+
+def most_common(sides: Iterable[str]) -> str:
+    """The side that most images have, of those of which it is known; "" for none."""
+    counts = Counter(side for side in sides if side)
+    return max(counts, key=lambda side: (counts[side], -SIDES.index(side)), default="")
 
 
 def sample_surface(depth_m: Floats, rays: Array) -> tuple[Floats, Floats]:

@@ -106,7 +106,8 @@ def make_segmenter(
     found = _made(options, sequence, find_weights)
     if upright is None or not options.is_network:
         return found
-    return UprightSegmenter(found, upright, None if options.ray else _finder(found))
+    is_known = options.ray or upright.side
+    return UprightSegmenter(found, upright, None if is_known else _finder(found))
 
 
 def _made(options: SegmenterOptions, sequence: Path, find_weights: FindWeights) -> Segmenter:

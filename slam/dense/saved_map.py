@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from bmask_slam.mapping.inverse_depth.dense_mapper import DepthSource
 from bmask_slam.run_folder.map_file import MAP, RunLabels, read_map, saved_labels
 from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.semantics.labels import LabelSet
+from bmask_slam.semantics.objects.gravity import most_common, sides_of
 from bmask_slam.sequences.right_images import RIGHT_LIST, RightImages, read_right_images
 from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.world.keyframe import Keyframe
@@ -35,7 +36,8 @@ class SavedMap:
         keyframes: those of its largest segment, oldest first.
         camera: of the images, with distortion.
         labels: the classes of its landmarks; None if the run had no segmenter.
-        side: the side of the images that is up, of `graph.camera.SIDES`; "" if that is not known.
+        sides: the side of keyframes' images that is up, of `graph.camera.SIDES`, by keyframe id; ""
+            where that is not known.
         up_world: (3,) unit vector of these keyframes, by an accelerometer or an IMU in the graph;
             None without.
     """
@@ -45,20 +47,27 @@ class SavedMap:
     keyframes: list[Keyframe]
     camera: Camera
     labels: RunLabels | None = None
-    side: str = ""
+    sides: dict[int, str] = field(default_factory=dict)
     up_world: Array | None = None
 
     def poses(self) -> dict[int, Array]:
         """The current T_world_camera (4, 4) of every keyframe by its id."""
         return {k.id: k.T_world_camera for k in self.world.keyframes.values()}
 
+    @property
+    def side(self) -> str:
+        """The side of most images that is up; "" if that is not known."""
+        return most_common(self.sides.values()) or self.camera.up
+
     def up_guess(self) -> Array:
         """About up (3,), a unit vector: by gravity, or the mean direction of the upper side."""
         if self.up_world is not None:
             return self.up_world
-        poses = np.array([k.T_world_camera for k in self.keyframes])
-        turns = poses[np.isfinite(poses).all(axis=(1, 2)), :3, :3]
-        up = np.mean(turns @ direction_of(self.side), axis=0)
+        ups = [
+            k.T_world_camera[:3, :3] @ direction_of(self.sides.get(k.id) or self.side)
+            for k in self.keyframes
+        ]
+        up = np.nanmean(ups, axis=0)
         return np.asarray(up / np.linalg.norm(up), float)
 
     def label_distributions(self, ids: Ints, names: LabelSet) -> tuple[Array, Mask]:
@@ -121,9 +130,15 @@ def read_saved_map(path: Path) -> SavedMap:
         segment = world.largest_segment()
         labels = saved_labels(part(state, "semantics"), path)
         up_world = _measured_up(part(state, "mapper.graph"), segment)
-        side = str(state.get("semantics.upright.side", np.array([""]))[0]) or camera.up
-        direction_of(side)
-    return SavedMap(path, world, world.in_segment(segment), camera, labels, side, up_world)
+        sides = _sides(part(state, "semantics.upright"))
+    return SavedMap(path, world, world.in_segment(segment), camera, labels, sides, up_world)
+
+
+def _sides(upright: Arrays) -> dict[int, str]:
+    """The side of the images that is up by keyframe id; none of older files."""
+    if "sides" not in upright:
+        return {}
+    return dict(zip(upright["keyframes"].tolist(), sides_of(upright["sides"]), strict=True))
 
 
 def _measured_up(graph: Arrays, segment: int) -> Array | None:

@@ -8,7 +8,7 @@ import pytest
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import SIDES, direction_of
 from bmask_slam.graph.geometry import so3_exp
-from bmask_slam.semantics.objects.gravity import GravityEstimator
+from bmask_slam.semantics.objects.gravity import GravityEstimator, most_common
 
 WIDTH, HEIGHT, FOCAL_PX = 320, 240, 250.0
 FLOOR_M = 1.2
@@ -66,6 +66,27 @@ def test_directions_of_sides(side: str, direction: list[float]) -> None:
     assert direction_of(side).tolist() == direction
 
 
+def test_keyframes_before_the_side_was_found_get_it_and_others_keep_theirs() -> None:
+    """As of a merged map, of a camera that was mounted otherwise in the other run."""
+    estimator, poses, up_world = looking_down("left")
+    estimator.use_side("left")
+    other, other_poses, other_up = looking_down("bottom")
+    other.use_side("bottom")
+    parts = estimator.state(), other.state()
+    joint = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    joint["keyframes"][1] = 8
+    both = GravityEstimator()
+    both.restore(joint)
+    assert both.up_world({7: poses[7]}) == pytest.approx(up_world, abs=1e-3)
+    assert both.up_world({8: other_poses[7]}) == pytest.approx(other_up, abs=1e-3)
+
+
+def test_the_most_common_side() -> None:
+    assert most_common(["", "left", "left", "top"]) == "left"
+    assert most_common(["bottom", "top"]) == "top"
+    assert most_common(["", ""]) == ""
+
+
 def test_the_side_is_kept_in_the_state() -> None:
     estimator, poses, up_world = looking_down("left")
     estimator.use_side("left")
@@ -73,8 +94,8 @@ def test_the_side_is_kept_in_the_state() -> None:
     other.restore(estimator.state())
     assert other.side == "left"
     assert other.up_world(poses) == pytest.approx(up_world, abs=1e-3)
-    older = {k: v for k, v in estimator.state().items() if k != "side"}
+    older = {k: v for k, v in estimator.state().items() if k != "sides"}
     other.restore(older)
     assert other.side == "left"
-    with pytest.raises(ValueError, match="not in tuple"):
-        other.restore({**older, "side": np.array(["below"])})
+    with pytest.raises(ValueError, match="sides of images are 0 to 4, found 5"):
+        other.restore({**older, "sides": np.array([5])})

@@ -94,7 +94,8 @@ def found_frame(parts: list[Cloud], pitch_deg: float, gravity: Array | None) -> 
         np.array(NAMES)[cloud.labels], np.ones(n), np.ones(n),
     )  # fmt: skip
     keyframes: Any = [
-        SimpleNamespace(T_world_camera=T) for T in (np.eye(4), np.full((4, 4), np.nan))
+        SimpleNamespace(id=k, T_world_camera=T)
+        for k, T in enumerate((np.eye(4), np.full((4, 4), np.nan)))
     ]
     up_world = None if gravity is None else T_map_world[:3, :3].T @ gravity
     saved = SavedMap(Path("run"), WorldMap(), keyframes, CAMERA, up_world=up_world)
@@ -136,15 +137,24 @@ def test_a_labelled_floor_is_level_to_a_camera_that_looks_down() -> None:
 
 def test_a_first_guess_of_up_is_gravity_or_the_mean_of_the_cameras() -> None:
     tilted, lost = camera_pose(90.0), np.full((4, 4), np.nan)
-    keyframes: Any = [SimpleNamespace(T_world_camera=T) for T in (np.eye(4), lost, tilted)]
+    keyframes: Any = [
+        SimpleNamespace(id=k, T_world_camera=T) for k, T in enumerate((np.eye(4), lost, tilted))
+    ]
     saved = SavedMap(Path("run"), WorldMap(), keyframes, CAMERA)
     mean = np.array([0.0, -1.0, 0.0]) - tilted[:3, 1]
     assert saved.up_guess() == pytest.approx(mean / np.linalg.norm(mean))
     measured = replace(saved, up_world=np.array([1.0, 0.0, 0.0]))
     assert measured.up_guess() == pytest.approx([1.0, 0.0, 0.0])
-    sideways = replace(saved, side="left").up_guess()
+    sideways = replace(saved, sides={0: "left", 1: "left"})
     mean = np.array([-1.0, 0.0, 0.0]) - tilted[:3, 0]
-    assert sideways == pytest.approx(mean / np.linalg.norm(mean))
+    assert sideways.up_guess() == pytest.approx(mean / np.linalg.norm(mean))
+    assert sideways.side == "left"
+    mixed = replace(saved, sides={0: "left", 2: "bottom"})
+    mean = np.array([-1.0, 0.0, 0.0]) + tilted[:3, 1]
+    assert mixed.up_guess() == pytest.approx(mean / np.linalg.norm(mean))
+    mounted = replace(saved, camera=replace(CAMERA, up="bottom"))
+    assert mounted.side == "bottom"
+    assert mounted.up_guess() == pytest.approx(-saved.up_guess())
 
 
 def test_gravity_says_where_up_is() -> None:
