@@ -26,6 +26,7 @@ from benchmarks.semantics.mounted import write_turned
 from benchmarks.semantics.real_rooms import ROOMS, score_objects
 from benchmarks.semantics.room_truth import centre_in, moved
 from benchmarks.suite import never_lost
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
@@ -198,6 +199,17 @@ def write_recording(folder: Path, camera: Camera) -> Trajectory:
     return truth
 
 
+def check_same_pixel(first: tuple[Path, Array], second: tuple[Path, Array], number: int) -> None:
+    """Colour and depth at a pixel (2,) of one recording are those at a pixel of another."""
+    for kind in ("rgb", "depth"):
+        found = []
+        for folder, pixel in (first, second):
+            u, v = np.rint(pixel).astype(int)
+            image = cv2.imread(str(folder / kind / f"{number}.png"), cv2.IMREAD_UNCHANGED)
+            found.append(image[v, u])
+        assert found[0] == found[1]
+
+
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_changed_recording_is_one_that_a_camera_could_have_made(name, tmp_path: Path) -> None:
     """The changed camera sees a flipped point where the flipped image shows what the point is."""
@@ -216,13 +228,7 @@ def test_a_changed_recording_is_one_that_a_camera_could_have_made(name, tmp_path
         point = transform(poses[k], np.array([[0.2, -0.3, 1.5]]))
         (seen,) = camera.project_distorted(transform(inverse(poses[k]), point))
         (again,) = changed.project_distorted(transform(inverse(T_world_changed), point * sign))
-        (u, v), (u_again, v_again) = np.rint(seen).astype(int), np.rint(again).astype(int)
-        for kind in ("rgb", "depth"):
-            before, after = (
-                cv2.imread(str(folder / kind / f"{k}.png"), cv2.IMREAD_UNCHANGED)
-                for folder in (source, out)
-            )
-            assert before[v, u] == after[v_again, u_again]
+        check_same_pixel((source, seen), (out, again), k)
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
@@ -237,13 +243,7 @@ def test_a_turned_recording_shows_the_same_world(turns: int, tmp_path: Path) -> 
         point = transform(poses[k], np.array([[0.2, -0.3, 1.5]]))
         (seen,) = camera.project_distorted(transform(inverse(poses[k]), point))
         (again,) = turned.project_distorted(transform(inverse(T_world_turned), point))
-        (u, v), (u_again, v_again) = np.rint(seen).astype(int), np.rint(again).astype(int)
-        for kind in ("rgb", "depth"):
-            before, after = (
-                cv2.imread(str(folder / kind / f"{k}.png"), cv2.IMREAD_UNCHANGED)
-                for folder in (source, out)
-            )
-            assert before[v, u] == after[v_again, u_again]
+        check_same_pixel((source, seen), (out, again), k)
 
 
 def test_a_vocabulary_is_a_tree_that_orb_slam_can_read() -> None:

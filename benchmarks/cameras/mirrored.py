@@ -10,6 +10,7 @@ order. The camera and the truth are changed with it.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.yaml_file import format_yaml, parse_yaml, read_yaml
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
 from bmask_slam.sequences.cameras import format_camera, read_camera
-from bmask_slam.sequences.lists import ImageList, image_name, read_lists
+from bmask_slam.sequences.lists import image_name, read_lists
 
 JPEG_QUALITY = 97
 
@@ -75,7 +76,7 @@ def write_changed(source: Path, out: Path, change: Change) -> None:
     lists = read_lists(source)
     ends_s = float(lists[0].timestamps_s[0]), float(lists[0].timestamps_s[-1])
     for name, images in zip(("rgb.txt", "depth.txt"), lists, strict=True):
-        _write_images(images, source, out, change)
+        write_images(images.files, source, out, change.image)
         stamps_s = change.stamps(images.timestamps_s, ends_s)
         rows = sorted(zip(stamps_s.tolist(), images.files, strict=True))
         text = "".join(f"{stamp:.6f} {image_name(file, source)}\n" for stamp, file in rows)
@@ -89,7 +90,11 @@ def write_changed(source: Path, out: Path, change: Change) -> None:
     write_tum(out / "groundtruth.txt", truth)
 
 
-def _write_images(images: ImageList, source: Path, out: Path, change: Change) -> None:
+def write_images(
+    files: Sequence[Path], source: Path, out: Path, change: Callable[[Image], Image]
+) -> None:
+    """Write images of a recording, changed, under their own names below another folder."""
+
     def write(file: Path) -> None:
         to = out / image_name(file, source)
         to.parent.mkdir(parents=True, exist_ok=True)
@@ -97,10 +102,10 @@ def _write_images(images: ImageList, source: Path, out: Path, change: Change) ->
         assert image is not None, f"{file}: no image"
         is_png = to.suffix.lower() == ".png"
         options = [] if is_png else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-        cv2.imwrite(str(to), change.image(image), options)
+        cv2.imwrite(str(to), change(image), options)
 
     with ThreadPoolExecutor(2) as pool:
-        list(pool.map(write, images.files))
+        list(pool.map(write, files))
 
 
 def main() -> None:

@@ -12,14 +12,9 @@ latter is not modelled, so that the trajectory is worse (ATE in mm).
 from __future__ import annotations
 
 import argparse
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 
-import cv2
-import numpy as np
-
-from benchmarks.cameras.mirrored import JPEG_QUALITY
+from benchmarks.cameras.mirrored import write_images
 from benchmarks.pages import table
 from benchmarks.paths import SHARED
 from benchmarks.semantics.real_rooms import (
@@ -35,6 +30,7 @@ from bmask_slam.graph.camera import SIDES
 from bmask_slam.graph.files.yaml_file import format_yaml, parse_yaml
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
 from bmask_slam.run_folder.reader import Run
+from bmask_slam.semantics.segmenters.upright import turned
 from bmask_slam.sequences.camera_presets import PRESETS, preset_of_folder
 from bmask_slam.sequences.cameras import format_camera, read_camera
 from bmask_slam.sequences.lists import image_name, read_lists
@@ -45,9 +41,7 @@ ROOMS = ("redkitchen", "bonn_crowd")
 def write_turned(source: Path, out: Path, turns: int) -> None:
     """Write a TUM folder with a groundtruth.txt, turned anticlockwise by right angles."""
     for name, images in zip(("rgb.txt", "depth.txt"), read_lists(source), strict=True):
-        targets = [out / image_name(file, source) for file in images.files]
-        with ThreadPoolExecutor(2) as pool:
-            list(pool.map(partial(_turn_image, turns), images.files, targets))
+        write_images(images.files, source, out, lambda image: turned(image, turns))
         lines = zip(images.timestamps_s.tolist(), images.files, strict=True)
         text = "".join(f"{stamp:.6f} {image_name(file, source)}\n" for stamp, file in lines)
         (out / name).write_text(text, encoding="utf-8")
@@ -60,14 +54,6 @@ def write_turned(source: Path, out: Path, turns: int) -> None:
     text["rolling_shutter"] = -(readout_s or 0.0) if turns == 2 else 0.0
     (out / "camera.yaml").write_text(format_yaml(text), encoding="utf-8")
     write_tum(out / "groundtruth.txt", Trajectory(poses.timestamps_s, T_world_camera))
-
-
-def _turn_image(turns: int, source: Path, out: Path) -> None:
-    out.parent.mkdir(parents=True, exist_ok=True)
-    image = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
-    assert image is not None, f"{source}: no image"
-    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if out.suffix.lower() != ".png" else []
-    cv2.imwrite(str(out), np.ascontiguousarray(np.rot90(image, turns)), options)
 
 
 def scored(title: str, room: str, sequence: Path, out: Path) -> tuple[str, ...]:
