@@ -124,11 +124,6 @@ class Camera:
         sigma_px = KINECT_DISPARITY_SIGMA_PX if disparity_sigma_px is None else disparity_sigma_px
         return DepthNoise.of_disparity(sigma_px, self.stereo_bf_px_m)
 
-    @property
-    def up_camera(self) -> Array:
-        """About up (3,) in the camera's frame: the direction of the side of the image."""
-        return direction_of(self.up)
-
     def turned(self, turns: int) -> tuple[Camera, Array]:
         """The camera of images turned anticlockwise by right angles, and T_self_turned (4, 4).
 
@@ -287,6 +282,11 @@ def distortion_terms(normalised: Array) -> Array:
     along_x = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x**2, x * r2**3], axis=-1)
     along_y = np.stack([y * r2, y * r2**2, r2 + 2 * y**2, 2 * x * y, y * r2**3], axis=-1)
     return np.stack([along_x, along_y], axis=-2)
+
+
+def side_towards(direction_camera: Array) -> str:
+    """The side of the image that a direction (3,) in the camera's frame points to most."""
+    return SIDES[int(np.argmax(np.array(_DIRECTIONS) @ direction_camera))]
 
 
 def direction_of(side: str) -> Array:

@@ -14,6 +14,7 @@ from PIL import Image as Pillow
 from PIL import ImageDraw, ImageFont
 
 from bmask_slam.graph.arrays import Array, Image
+from bmask_slam.graph.camera import SIDES, side_towards
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, nearest_indices
 from bmask_slam.graph.whole_file import whole_file
@@ -31,6 +32,7 @@ from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.run_folder.semantic_files import OBJECTS, SavedObject, read_scene
 from bmask_slam.semantics.objects.boxes3d import EDGES
+from bmask_slam.semantics.segmenters.upright import turned
 from bmask_slam.sequences.sequence import open_sequence
 
 FILM = "film.gif"
@@ -111,17 +113,26 @@ class _Film:
         has_camera = (options.run / "graph").is_file()
         self._sequence = open_sequence(folder, camera=self._run.camera if has_camera else None)
         self._dense = options.run / DENSE / "cloud.ply"
-        self._size = self._image_size()
         self._shots: list[Shot] = []
         scene = read_scene(options.run) if (options.run / OBJECTS).is_file() else None
         self._objects = () if scene is None else scene.objects
         self._up = None if scene is None else scene.up_world
+        self._turns = SIDES.index(self._upper_side())
+        self._camera, self._T_camera_upright = self._sequence.camera.turned(self._turns)
+        self._size = self._image_size()
         labels = sorted({o.label for o in self._objects})
         self._colours = {label: RGB[k % (len(RGB) - 1)] for k, label in enumerate(labels)}
 
+    def _upper_side(self) -> str:
+        """The side of most images that is up: by the objects' world, or as the camera says."""
+        if self._up is None or not len(self._run.trajectory):
+            return self._sequence.camera.up or SIDES[0]
+        ups = self._run.trajectory.poses_world_camera[:, :3, :3].transpose(0, 2, 1) @ self._up
+        return side_towards(ups.mean(axis=0))
+
     def _image_size(self) -> tuple[int, int]:
         """Width and height of each half of the film; even, as videos want them."""
-        camera = self._sequence.camera
+        camera = self._camera
         width = (self._options.width_px - GAP_PX) // 4 * 2
         return width, round(width * camera.height / camera.width / 2) * 2
 
@@ -147,22 +158,24 @@ class _Film:
             raise InputError(f"{self._run.path}: fewer than {MIN_SHOTS} frames to film")
 
     def _shot(self, index: int, T_world_camera: Array) -> Shot:
-        frame, camera = self._sequence.load(index), self._sequence.camera
+        """A frame as an upright camera would have taken it."""
+        frame, T_world_camera = self._sequence.load(index), T_world_camera @ self._T_camera_upright
+        rgb, depth = (turned(image, self._turns) for image in (frame.rgb, frame.depth_m))
         points, colours = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
         if not self._dense.is_file():
-            points, colours = sampled_points(frame.rgb, frame.depth_m, camera)
+            points, colours = sampled_points(rgb, depth, self._camera)
             points = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-        small = cv2.resize(frame.rgb, self._size, interpolation=cv2.INTER_AREA)
-        depth_m = frame.depth_m[::DEPTH_STEP_PX, ::DEPTH_STEP_PX].copy()
+        small = cv2.resize(rgb, self._size, interpolation=cv2.INTER_AREA)
+        depth_m = depth[::DEPTH_STEP_PX, ::DEPTH_STEP_PX].copy()
         kept = points.astype(np.float32), colours
         return Shot(index, frame.timestamp_s, small, depth_m, T_world_camera, *kept)
 
     def pictures(self) -> Iterator[Image]:
         """The pictures (H, W, 3), red first."""
         poses = np.stack([shot.T_world_camera for shot in self._shots])
-        up = (poses[:, :3, :3] @ self._sequence.camera.up_camera).mean(axis=0)
+        up = -poses[:, :3, 1].mean(axis=0)
         up_world = up / np.linalg.norm(up) if self._up is None else self._up
-        cloud = make_cloud(self._shots, self._sequence.camera, self._dense)
+        cloud = make_cloud(self._shots, self._camera, self._dense)
         if not len(cloud.first):
             raise InputError(f"{self._run.path}: no depth in the frames; there is nothing to film")
         view = make_view(cloud, poses, up_world, self._size)
@@ -184,7 +197,7 @@ class _Film:
 
     def _frame(self, shot: Shot, there: Sequence[SavedObject]) -> tuple[Image, list[_Name]]:
         """The image with the names of the objects that are in it."""
-        camera, names = self._sequence.camera, []
+        camera, names = self._camera, []
         if there:
             centres = np.stack([o.centroid_world for o in there])
             rows, pixels, z = in_image(centres, shot.T_world_camera, camera)
@@ -205,7 +218,7 @@ class _Film:
         for o in there:
             drawn.edges(o.box.corners_world[EDGES], self._colours[o.label])
         drawn.line(poses[:, :3, 3], PATH_COLOUR, 2)
-        drawn.frustum(poses[-1], self._sequence.camera, CAMERA_COLOUR)
+        drawn.frustum(poses[-1], self._camera, CAMERA_COLOUR)
         if not there:
             return drawn.image, []
         places, ahead = drawn.place(np.stack([o.box.T_world_box[:3, 3] for o in there]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,9 +18,11 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import make_pose
 from bmask_slam.offline import runner
 from bmask_slam.offline.options import RunOptions
-from bmask_slam.reporting.film import FilmOptions, write_film
+from bmask_slam.reporting.film import GAP_PX, STRIP_PX, FilmOptions, write_film
 from bmask_slam.reporting.film_cloud import DEPTH_STEP_PX, Shot, make_cloud, sampled_points
 from bmask_slam.reporting.film_view import BACKGROUND, MapPicture, make_view
+from bmask_slam.run_folder.origin import find_sequence
+from bmask_slam.sequences.cameras import read_camera, write_camera
 
 CAMERA = Camera(64, 48, 60, 60, 31.5, 23.5)
 UP = np.array([0.0, -1.0, 0.0])
@@ -88,6 +91,28 @@ def test_a_gif_loops_and_has_the_same_bytes_again(run: Path, tmp_path: Path) -> 
         assert (film.n_frames, film.info["loop"], film.width) == (5, 0, 200)
     again = write_film(replace(options, out=tmp_path / "again.gif"))
     assert again.read_bytes() == path.read_bytes()
+
+
+def test_frames_of_a_camera_that_is_mounted_sideways_are_upright(run: Path, tmp_path: Path) -> None:
+    """The left half of the film is the frame, turned so that its left side is up."""
+    camera, pictures = read_camera(find_sequence(run) / "camera.yaml"), []
+    for side in ("top", "left"):
+        mounted = tmp_path / side
+        shutil.copytree(find_sequence(run), mounted)
+        write_camera(mounted / "camera.yaml", replace(camera, up=side))
+        for file in (mounted / "rgb").iterdir():
+            image = np.full((camera.height, camera.width, 3), 40, np.uint8)
+            image[: camera.height // 3, : camera.width // 2] = (0, 200, 255)
+            cv2.imwrite(str(file), image)
+        path = write_film(FilmOptions(run, tmp_path / f"{side}.gif", mounted, 1, 5, 200))
+        with Image.open(path) as film:
+            pictures.append(np.asarray(film.convert("RGB"), float))
+    width = (200 - GAP_PX) // 4 * 2
+    plain, again = (picture[:-STRIP_PX, :width] for picture in pictures)
+    assert len(again) == round(width * camera.width / camera.height / 2) * 2
+    expected = cv2.resize(np.rot90(plain, 3), (width, len(again)))
+    off, upside_down = (np.abs(again - e).mean() for e in (expected, expected[::-1, ::-1]))
+    assert off < 0.5 * upside_down
 
 
 def test_an_mp4_has_its_pictures_and_its_end(run: Path, tmp_path: Path) -> None:
