@@ -13,7 +13,7 @@ from bmask_slam.semantics.instances.surfaces import Segmented, SurfaceClasses
 from bmask_slam.semantics.network.box_head import ClassifiedBoxes
 from bmask_slam.semantics.network.model import Detections
 from bmask_slam.semantics.network.yolox.mask_scoring import around
-from bmask_slam.semantics.network.yolox.network import Features, decode
+from bmask_slam.semantics.network.yolox.network import SIDE_PX, Features, decode
 from bmask_slam.semantics.network.yolox.selection import SelectionConfig, select
 from bmask_slam.semantics.network.yolox.stuff import STUFF_STRIDE
 from bmask_slam.semantics.segmenters.network_segmenter import as_instances
@@ -68,12 +68,9 @@ class LightSegmenter:
         check_image(image, name)
         size = (image.shape[0], image.shape[1])
         with torch.inference_mode(), one_thread():
-            tensor = torch.from_numpy(image).to(self._device).permute(2, 0, 1)
-            padded, factor = self._model.detector.letterboxed(tensor)
-            features = self._model.detector.features(padded)
-            output = self._model.detector.detections(features)
+            features, output, padded, factor = self._seen(image, SIDE_PX)
             if self._detector is None:
-                found = self._selected(output[0], padded, factor, size)
+                found = self._selected(output[0], padded, factor, size, self._selection)
             else:
                 found = self._detector.detect(image, self.labels).to(self._device)
             logits, ious = self._model.masks(features, [found.boxes * factor])
@@ -87,19 +84,28 @@ class LightSegmenter:
         check_image(image, "image")
         size = (image.shape[0], image.shape[1])
         with torch.inference_mode(), one_thread():
-            tensor = torch.from_numpy(image).to(self._device).permute(2, 0, 1)
-            padded, factor = self._model.detector.letterboxed(tensor, max(size))
-            output = self._model.detector.detections(self._model.detector.features(padded))
-            boxes, p = decode(output[0], (padded.shape[2], padded.shape[3]))
+            _, output, padded, factor = self._seen(image, max(size))
             sure = SelectionConfig(SURE_SCORE)
-            return float(select(boxes / factor, p, size, self.labels, sure).scores.sum())
+            return float(self._selected(output[0], padded, factor, size, sure).scores.sum())
+
+    def _seen(self, image: Image, side_px: int) -> tuple[Features, Tensor, Tensor, float]:
+        """Features and raw detections of an image (H, W, 3), the input, and the factor to it."""
+        tensor = torch.from_numpy(image).to(self._device).permute(2, 0, 1)
+        padded, factor = self._model.detector.letterboxed(tensor, side_px)
+        features = self._model.detector.features(padded)
+        return features, self._model.detector.detections(features), padded, factor
 
     def _selected(
-        self, output: Tensor, padded: Tensor, factor: float, size: tuple[int, int]
+        self,
+        output: Tensor,
+        padded: Tensor,
+        factor: float,
+        size: tuple[int, int],
+        selection: SelectionConfig,
     ) -> ClassifiedBoxes:
         """Boxes in an image of (height, width), of which the input is ``factor`` times as large."""
         boxes, probabilities = decode(output, (padded.shape[2], padded.shape[3]))
-        return select(boxes / factor, probabilities, size, self.labels, self._selection)
+        return select(boxes / factor, probabilities, size, self.labels, selection)
 
     def _surfaces(
         self, features: Features, output: Tensor, factor: float, size: tuple[int, int]

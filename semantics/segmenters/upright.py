@@ -96,20 +96,18 @@ class UprightSegmenter:
     def segment(self, image: Image, name: str) -> list[Instance]:
         """Instances in an image (H, W, 3) as it is, found in the turned one."""
         check_image(image, name)
-        turns = SIDES.index(self._up(image))
+        if self._votes is not None:
+            self._vote(self._votes, image)
+        turns = SIDES.index(self._side or SIDES[0])
         found = self._inner.segment(turned(image, turns), name)
         return turned_back(found, turns, (image.shape[0], image.shape[1]), self._side)
 
-    def _up(self, image: Image) -> str:
-        """The side of an image that is taken to be up."""
-        if self._votes is not None:
-            for seen in self._samples or (image,):
-                self._side = self._side or self._votes.add(seen)
-            if self._samples:
-                self._side = self._side or SIDES[0]
-            if self._side:
-                self._votes = None
-        return self._side or SIDES[0]
+    def _vote(self, votes: UpVotes, image: Image) -> None:
+        """Look for the side that is up, in all samples at once or else in this image."""
+        told = map(votes.add, self._samples or (image,))
+        self._side = next(filter(None, told), SIDES[0] if self._samples else "")
+        if self._side:
+            self._votes, self._samples = None, ()
 
 
 def sample(image: Image) -> Image:

@@ -180,7 +180,7 @@ def open_fusion(options: MapOptions) -> RunFusion:
     """The fusion of a finished run. Raises InputError as ``map_run``."""
     run = open_run(options.run, options.sequence)
     masks = options.masks or run_semantics(options.run).segmenter
-    upright = Upright(run.side) if run.side else upright_of(run.sequence)
+    upright = Upright(run.side) if run.side else upright_of(masks, run.sequence)
     segmenter = make_segmenter(masks, run.sequence.folder, find_weights, upright)
     return RunFusion(run, segmenter, replace(options, masks=masks))
 

@@ -216,8 +216,8 @@ def _system_maker(
     """
     chosen, folder = options.config.semantics.segmenter, sequence.folder
     upright = Upright()
-    if chosen.is_network and given is None and not options.localise:
-        upright = upright_of(sequence, run_indices(sequence, options))
+    if given is None and not options.localise:
+        upright = upright_of(chosen, sequence, run_indices(sequence, options))
     if given is None and options.dense:
         import_dense("--map")
     if given is not None:

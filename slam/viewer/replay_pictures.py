@@ -41,7 +41,7 @@ class ReplayPictures:
             self._sequence = open_sequence(sequence or find_sequence(run))
             folder, options = self._sequence.folder, run_semantics(run).segmenter
             if self._masked:
-                upright = upright_of(self._sequence) if options.is_network else None
+                upright = upright_of(options, self._sequence)
                 self._segmenter = make_segmenter(options, folder, find_weights, upright)
         except InputError as error:
             what = "masks" if self._sequence is not None else "images"
