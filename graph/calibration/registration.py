@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter, shift
 from bmask_slam.graph.arrays import Array
 
 MIN_FRAMES = 8
-DELAYS_S = np.arange(-0.08, 0.0801, 0.008)
+DELAYS_S = np.arange(-0.12, 0.1201, 0.008)
 SMOOTH = 1.0
 """Steps by which maps are smoothed, so that the largest place is that of a peak, not of noise."""
 BOOTSTRAPS, SEED = 60, 0

@@ -9,8 +9,7 @@ two standard errors (`graph.calibration.cross_validation`). Where halves in the 
 prove it, every second keyframe is in the other half.
 
 A run with a wrong camera has matched what fits that camera, which draws the estimate towards it. So
-its landmarks are searched again (`calibration.rematching`), and its last look, with all frames and
-a map of the camera found before, decides on all of it anew.
+its landmarks are searched again (`calibration.rematching`), and its last look decides anew.
 """
 
 from __future__ import annotations
@@ -34,11 +33,10 @@ logger = logging.getLogger(__name__)
 TIMES = (SHUTTER, TIME)
 BENDS = tuple(range(len(PARAMETERS))[BEND])
 FREE = (*TIMES, *BENDS)
-"""The parameters that are estimated, by their places in PARAMETERS."""
 CALIBRATE = ("auto", "report", "off")
 """Whether what is found is used, only told, or not looked for."""
 NAMES = {SHUTTER: "rolling shutter", TIME: "colour-depth delay"}
-MAX_S = 0.035
+MAX_READOUT_S, MAX_DELAY_S = 0.035, 0.1
 UNOBSERVABLE = "readout, delay and bend of depth not observable in the motion"
 PLACES = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-0.75, 0.75, 7)), axis=-1)
 BEND_TERMS = depth_distortion_terms(PLACES).reshape(-1, len(BENDS))
@@ -54,12 +52,15 @@ class SelfCalibrationConfig:
             long as the motion does not show the parameters.
         min_frames: fewer are not looked at, at the end of a sequence.
         stretches: how often it is looked at in vain at most.
-        max_sigma_s: largest standard deviation of a parameter that counts as observable.
+        max_sigma_s: largest standard deviation of a time that counts as observable,
+        max_sigma_share: or share of the time itself: what is that large is known well enough.
         min_change_sigmas: what is adopted differs by so many standard deviations,
         min_change_s: and by so much.
         min_gain_sigmas: so many standard errors is the gain on observations kept out of the fit.
-        max_s: a time that is surely larger is no readout within a frame's interval, but an error;
+        max_readout_s: what is surely longer is no readout within a frame's interval, but an error;
             of one that may be, so much is adopted.
+        max_delay_s: the same of the delay of depth, which drivers that stamp images as they arrive
+            make longer than a frame's interval.
         max_bend_sigma, min_bend, max_bend: the same limits of the distortion of depth, in 1/m.
         surer: what knows the distortion of depth to so small a share of the standard deviation of
             the one adopted before takes its place.
@@ -69,10 +70,12 @@ class SelfCalibrationConfig:
     min_frames: int = 90
     stretches: int = 3
     max_sigma_s: float = 0.004
+    max_sigma_share: float = 0.1
     min_change_sigmas: float = 3.0
     min_change_s: float = 0.002
     min_gain_sigmas: float = 2.0
-    max_s: float = MAX_S
+    max_readout_s: float = MAX_READOUT_S
+    max_delay_s: float = MAX_DELAY_S
     max_bend_sigma: float = 0.004
     min_bend: float = 0.003
     max_bend: float = 0.1
@@ -82,7 +85,8 @@ class SelfCalibrationConfig:
         """Largest sigma, smallest change and largest value of a parameter."""
         if i in BENDS:
             return self.max_bend_sigma, self.min_bend, self.max_bend
-        return self.max_sigma_s, self.min_change_s, self.max_s
+        largest = self.max_readout_s if i == SHUTTER else self.max_delay_s
+        return self.max_sigma_s, self.min_change_s, largest
 
 
 @dataclass(frozen=True)
@@ -151,8 +155,10 @@ class Estimate:
 
     def shows(self, i: int, config: SelfCalibrationConfig) -> bool:
         """Whether a parameter is observable; the distortion of depth is so over the whole image."""
-        sigma = _rms_sigma(self.sigmas[BEND]) if i in BENDS else self.sigmas[i]
-        return bool(0 < sigma < config.limits(i)[0])
+        if i in BENDS:
+            return bool(0 < _rms_sigma(self.sigmas[BEND]) < config.max_bend_sigma)
+        share = config.max_sigma_share * abs(self.found[i])
+        return bool(0 < self.sigmas[i] < max(config.max_sigma_s, share))
 
     def agrees(self, i: int, halves: CrossValidation, config: SelfCalibrationConfig) -> bool:
         """Whether either half finds a parameter: within its bounds, or nearer to what was found
@@ -269,8 +275,8 @@ def camera_with(camera: Camera, values: Array, chosen: list[int]) -> Camera:
     """The camera with some of the parameters of a vector (18,), rounded as in camera.yaml."""
     calibration = parameters_of(camera, camera.depth_scale)
     calibration[chosen] = values[chosen]
-    times = list(TIMES)
-    calibration[times] = np.clip(calibration[times], -MAX_S, MAX_S)
+    calibration[SHUTTER] = np.clip(calibration[SHUTTER], -MAX_READOUT_S, MAX_READOUT_S)
+    calibration[TIME] = np.clip(calibration[TIME], -MAX_DELAY_S, MAX_DELAY_S)
     found = camera_from(camera, calibration)
     return dataclasses.replace(
         camera,

@@ -27,6 +27,7 @@ from bmask_slam.graph.calibration.model import (
 from bmask_slam.graph.calibration.problem import CalibrationProblem
 from bmask_slam.graph.calibration.registration import Registration, register
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.run_folder.metrics import row
 from bmask_slam.sequences.sequence import Sequence
@@ -91,6 +92,17 @@ def check_camera(run: SavedRun, sequence: Sequence) -> CameraCheck:
     warnings = tuple(f.text for f in findings if f.is_warning)
     rows = [r for f in findings for r in f.rows] + [row("camera_warnings", len(warnings), "1")]
     return CameraCheck(warnings, tuple(f.text for f in findings if not f.is_warning), tuple(rows))
+
+
+def sure_delay(path: Trajectory, sequence: Sequence) -> Registration | None:
+    """How depth lies on colour, where depth is surely later or earlier than of a right camera.
+
+    ``sequence`` must have the camera with which the path was found. Raises InputError as above.
+    """
+    found = register(edge_scores(sequence, path))
+    if found is None or found.strength < MIN_STRENGTH:
+        return None
+    return found if _is_surely_late(found) else None
 
 
 def stored_problem(run: SavedRun) -> CalibrationProblem | None:
@@ -178,10 +190,14 @@ def _delay(found: Registration, camera: Camera) -> _Finding:
     )
     later = "later" if delay_s > 0 else "earlier"
     shown = f"{1e3 * abs(delay_s):.0f} ± {1e3 * bound_s:.0f} ms {later} than stamps and camera say"
-    if abs(delay_s) > MAX_DELAY_S and abs(delay_s) - bound_s > SURE_DELAY_S:
-        offset_s = camera.depth_time_offset_s + delay_s
-        cure = f"run with --calibrate auto, or set depth_time_offset: {offset_s:.3f} in camera.yaml"
+    if _is_surely_late(found):
+        cure = f"set depth_time_offset: {camera.depth_time_offset_s + delay_s:.3f} in camera.yaml"
         return _Finding(f"stamps: depth images are {shown}; {cure}", True, rows)
     if bound_s > MAX_DELAY_BOUND_S:
         return _Finding(f"stamps: delay of depth not observable in this motion ({shown})")
     return _Finding(f"stamps: depth images are {shown}", rows=rows)
+
+
+def _is_surely_late(found: Registration) -> bool:
+    delay_s, bound_s = abs(found.delay_s), NORMAL_95 * found.delay_sigma_s
+    return delay_s > MAX_DELAY_S and delay_s - bound_s > SURE_DELAY_S

@@ -6,7 +6,8 @@ the delay and the distortion of the depth images, are estimated from its map
 those of a published calibration are better than what a short stretch shows, and an error of the
 depth scale, which images and depths alone do not show, would be taken for one of theirs. A readout
 time that the camera has is kept. Whether they are adopted is decided in `calibration.adoption`. If
-none is, the run goes on; else it begins anew, once, with the camera that was found.
+none is, the run goes on; else it begins anew, once, with the camera that was found. If edges of
+depth show a delay that no right camera has, it begins anew with that before (`camera_check`).
 
 After the last frame such a run is looked at once more. Its map shows more than the first stretch,
 and was not bent by the wrong camera. The keyframes are interpreted anew with what is found then,
@@ -29,6 +30,7 @@ from bmask_slam.calibration.adoption import (
     format_found,
     judged,
 )
+from bmask_slam.calibration.camera_check import NORMAL_95, sure_delay
 from bmask_slam.calibration.keyframe_motions import (
     depth_change_between,
     frame_motions,
@@ -88,11 +90,7 @@ class SelfCalibrator:
     def look(self, system: System, sequence: Sequence) -> bool:
         """Take what the run shows by now into account; whether it is to begin anew."""
         before = self.state
-        estimate = self._estimate(system, sequence)
-        if estimate is None:
-            self.state = replace(before, looks=before.looks + 1)
-        else:
-            self.state = judged(before, estimate, self._mode, self._config)
+        self.state = self._by_edges(system, sequence) or self._by_motion(system, sequence)
         text = self.state.text
         if text != before.text:
             logger.info("calibration: %s", text)
@@ -116,6 +114,35 @@ class SelfCalibrator:
         system.events.calibration(self.state.text)
         system.use_camera(camera, *_motions(system, sequence, camera))
         return True
+
+    def _by_edges(self, system: System, sequence: Sequence) -> SelfCalibration | None:
+        """The state with the delay of depth that edges show, if that is far from a right camera's.
+
+        So large a delay bends the map, and with it what the motion says of the camera.
+        """
+        if self._mode != "auto" or self.state.adopted or not isinstance(system, SlamSystem):
+            return None
+        path = system.as_run().trajectories["trajectory.txt"]
+        try:
+            found = sure_delay(path, sequence)
+        except InputError as error:
+            logger.info("calibration: %s", error)
+            return None
+        if found is None:
+            return None
+        offset_s = round(sequence.camera.depth_time_offset_s + found.delay_s, 4)
+        bound_ms = 1e3 * NORMAL_95 * found.delay_sigma_s
+        text = f"colour-depth delay {1e3 * offset_s:.1f} ± {bound_ms:.1f} ms by edges of depth"
+        camera = replace(self.state.camera, depth_time_offset_s=offset_s)
+        return replace(self.state, camera=camera, text=f"{text}: found and applied")
+
+    def _by_motion(self, system: System, sequence: Sequence) -> SelfCalibration:
+        """The state with what observations and depths of the map show."""
+        before, estimate = self.state, self._estimate(system, sequence)
+        if estimate is None:
+            return replace(before, looks=before.looks + 1)
+        found = judged(before, estimate, self._mode, self._config)
+        return replace(found, settled=True) if before.adopted else found
 
     def _forget_masks(self) -> None:
         if self._masks is not None and (self.finished or self._mode == "report"):

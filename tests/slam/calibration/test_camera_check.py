@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from shifted_stamps import with_depth_stamps
 
 from bmask_slam.calibration.camera_check import CameraCheck, check_camera
 from bmask_slam.calibration.edge_scores import correlation, edges_of
@@ -115,15 +116,8 @@ def test_depth_of_another_focal_length_is_named(
 def test_stamps_of_depth_that_are_wrong_are_named(
     late_sweep: Path, right: RunSummary, tmp_path: Path, frames: int
 ) -> None:
-    lines = []
-    for line in (late_sweep / "depth.txt").read_text().splitlines():
-        if not line.startswith("#"):
-            stamp, name = line.split(maxsplit=1)
-            lines.append(f"{float(stamp) + frames / FPS:.6f} {name}")
-    for name in ("rgb", "depth", "rgb.txt", "camera.yaml"):
-        (tmp_path / name).symlink_to(late_sweep / name)
-    (tmp_path / "depth.txt").write_text("\n".join(lines) + "\n")
-    (warning,) = (w for w in _checked(right, tmp_path).warnings if w.startswith("stamps"))
+    shifted = with_depth_stamps(late_sweep, tmp_path, frames / FPS)
+    (warning,) = (w for w in _checked(right, shifted).warnings if w.startswith("stamps"))
     assert ("ms earlier" if frames > 0 else "ms later") in warning
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_run import FakeSystem, make_sequence
+from shifted_stamps import with_depth_stamps
 
 from bmask_slam.calibration.adoption import (
     BENDS,
@@ -50,7 +51,7 @@ from bmask_slam.semantics.instances.surfaces import Segmented, up_of
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.semantics.segmenters.upright import Upright
-from bmask_slam.sequences.cameras import read_camera
+from bmask_slam.sequences.cameras import read_camera, write_camera
 from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
@@ -126,6 +127,28 @@ def test_a_delay_is_found_and_adopted(
         assert (out / name).read_bytes() == (found.folder / name).read_bytes(), name
 
 
+def test_depth_of_the_frame_before_is_noticed_by_its_edges_and_cured(
+    late_sweep: Path, sweep_camera: Camera, quick: None, tmp_path: Path
+) -> None:
+    shift_s = 1 / 15.0
+    sequence = with_depth_stamps(late_sweep, tmp_path / "shifted", shift_s)
+    done = run(late_options(sequence, tmp_path / "run"))
+    events = Run(done.folder).events
+    first = next(event for event in events if event.kind is EventKind.CALIBRATION)
+    assert "by edges of depth: found and applied" in first.text, first
+    right = replace(sweep_camera, depth_time_offset_s=sweep_camera.depth_time_offset_s - shift_s)
+    found = read_camera(done.folder / "camera.yaml")
+    assert found.depth_time_offset_s == pytest.approx(right.depth_time_offset_s, abs=0.005)
+    write_camera(tmp_path / "right.yaml", right)
+    known = replace(late_options(sequence, tmp_path / "known"), camera=tmp_path / "right.yaml")
+    assert ate_m(done) < 1.2 * ate_m(run(replace(known, calibrate="off")))
+
+
+def ate_m(done: RunSummary) -> float:
+    """Of a run."""
+    return float(next(row["value"] for row in done.rows if row["name"] == "ate_rmse"))
+
+
 def test_the_map_of_such_a_run_is_continued_with_its_camera(
     found: RunSummary, late_sweep: Path, tmp_path: Path
 ) -> None:
@@ -160,20 +183,18 @@ def test_report_and_off_change_nothing(late_sweep: Path, quick: None, tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("change_ms", "sigma_ms", "differs"),
+    ("place", "change_ms", "sigma_ms", "differs"),
     [
-        (20.0, 1.0, True),
-        (-14.0, 2.0, True),
-        (2.0, 1.0, False),
-        (20.0, 6.0, False),
-        (60, 1, False),
-        (36.5, 1.5, True),
+        (TIME, 20, 1, True), (TIME, -14, 2, True), (TIME, 2, 1, False), (TIME, 20, 6, False),
+        (TIME, 60, 1, True), (TIME, -60, 5.5, True), (TIME, -60, 6.5, False),
+        (TIME, 120, 1, False), (TIME, 101, 1, True),
+        (SHUTTER, 20, 1, True), (SHUTTER, 60, 1, False), (SHUTTER, 36.5, 1.5, True),
     ],
 )  # fmt: skip
 def test_only_observable_parameters_are_changed(
-    change_ms: float, sigma_ms: float, differs: bool
+    place: int, change_ms: float, sigma_ms: float, differs: bool
 ) -> None:
-    found = np.where(np.arange(18) == TIME, 1e-3 * change_ms, 0.0)
+    found = np.where(np.arange(18) == place, 1e-3 * change_ms, 0.0)
     estimate = Estimate(
         np.zeros(18),
         found,
@@ -181,8 +202,8 @@ def test_only_observable_parameters_are_changed(
         None,  # type: ignore[arg-type]
     )
     config = SelfCalibrationConfig()
-    assert estimate.differs(TIME, config) is differs
-    assert not estimate.differs(SHUTTER, config)
+    assert estimate.differs(place, config) is differs
+    assert not estimate.differs(TIME + SHUTTER - place, config)
 
 
 @pytest.mark.parametrize(
