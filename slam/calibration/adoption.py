@@ -6,10 +6,7 @@ adopted; the last, five coefficients, as a whole.
 What was found is adopted if it is observable, differs from what the camera given for the run has,
 is found by either half of the keyframes, and fits the half that it was not estimated from better by
 two standard errors (`graph.calibration.cross_validation`). Where halves in the order of time do not
-prove it, every second keyframe is in the other half.
-
-A run with a wrong camera has matched what fits that camera, which draws the estimate towards it. So
-its landmarks are searched again (`calibration.rematching`), and its last look decides anew.
+prove it, every second keyframe is in the other half. The last look of a run decides anew.
 """
 
 from __future__ import annotations
@@ -59,8 +56,7 @@ class SelfCalibrationConfig:
         min_gain_sigmas: so many standard errors is the gain on observations kept out of the fit.
         max_readout_s: what is surely longer is no readout within a frame's interval, but an error;
             of one that may be, so much is adopted.
-        max_delay_s: the same of the delay of depth, which drivers that stamp images as they arrive
-            make longer than a frame's interval.
+        max_delay_s: the same of the delay of depth; drivers may stamp images as they arrive.
         max_bend_sigma, min_bend, max_bend: the same limits of the distortion of depth, in 1/m.
         surer: what knows the distortion of depth to so small a share of the standard deviation of
             the one adopted before takes its place.
@@ -81,12 +77,11 @@ class SelfCalibrationConfig:
     max_bend: float = 0.1
     surer: float = 0.75
 
-    def limits(self, i: int) -> tuple[float, float, float]:
-        """Largest sigma, smallest change and largest value of a parameter."""
+    def limits(self, i: int) -> tuple[float, float]:
+        """Smallest change and largest value of a parameter."""
         if i in BENDS:
-            return self.max_bend_sigma, self.min_bend, self.max_bend
-        largest = self.max_readout_s if i == SHUTTER else self.max_delay_s
-        return self.max_sigma_s, self.min_change_s, largest
+            return self.min_bend, self.max_bend
+        return self.min_change_s, self.max_readout_s if i == SHUTTER else self.max_delay_s
 
 
 @dataclass(frozen=True)
@@ -126,7 +121,7 @@ class Estimate:
 
     def differs(self, i: int, config: SelfCalibrationConfig) -> bool:
         """Whether a parameter is observable, possible, and not that of the camera given."""
-        _, min_change, largest = config.limits(i)
+        min_change, largest = config.limits(i)
         change = abs(self.found[i] - self.before[i])
         return bool(
             self.shows(i, config)
@@ -144,7 +139,7 @@ class Estimate:
         steps[BENDS[0]] = _rms(change[BEND]), _rms_sigma(self.sigmas[BEND])
         return any(
             self.shows(i, config)
-            and step > max(config.min_change_sigmas * sigma, config.limits(i)[1])
+            and step > max(config.min_change_sigmas * sigma, config.limits(i)[0])
             for i, (step, sigma) in steps.items()
         )
 
@@ -187,7 +182,7 @@ def _rms(bend: Array) -> float:
 
 
 def _rms_sigma(sigmas: Array) -> float:
-    """Standard deviation of a distortion with those (5,) of its coefficients, in 1/m."""
+    """Of a distortion with those (5,) of its coefficients, in 1/m."""
     return float(np.sqrt(np.mean(BEND_TERMS**2 @ sigmas**2)))
 
 
@@ -232,8 +227,7 @@ def judged(
     text = format_found(estimate, seen, verdict) if seen else UNOBSERVABLE
     looked_for = np.count_nonzero(estimate.sigmas[list(free)])
     settled = bool(len(seen) == looked_for and not differs)
-    looks = state.looks + 1
-    return dataclasses.replace(state, text=text, looks=looks, settled=settled)
+    return dataclasses.replace(state, text=text, looks=state.looks + 1, settled=settled)
 
 
 def adopted_parameters(state: SelfCalibration) -> set[int]:

@@ -8,10 +8,11 @@ scale of depth has no statistic: images and depth fit a world of any size equall
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bmask_slam.calibration.adoption import SelfCalibration
 from bmask_slam.calibration.edge_scores import best_scale, edge_scores
 from bmask_slam.calibration.motion import as_exposed, landmark_motion
 from bmask_slam.calibration.views import connected_views
@@ -25,9 +26,8 @@ from bmask_slam.graph.calibration.model import (
     parameters_of,
 )
 from bmask_slam.graph.calibration.problem import CalibrationProblem
-from bmask_slam.graph.calibration.registration import Registration, register
+from bmask_slam.graph.calibration.registration import EdgeScores, Registration, register
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.run_folder.metrics import row
 from bmask_slam.sequences.sequence import Sequence
@@ -94,15 +94,21 @@ def check_camera(run: SavedRun, sequence: Sequence) -> CameraCheck:
     return CameraCheck(warnings, tuple(f.text for f in findings if not f.is_warning), tuple(rows))
 
 
-def sure_delay(path: Trajectory, sequence: Sequence) -> Registration | None:
-    """How depth lies on colour, where depth is surely later or earlier than of a right camera.
+def with_sure_delay(
+    state: SelfCalibration, scores: EdgeScores, offset_s: float
+) -> SelfCalibration | None:
+    """The state with the delay of depth that edges show, if it is far from a right camera's.
 
-    ``sequence`` must have the camera with which the path was found. Raises InputError as above.
+    So large a delay bends the map, and with it what the motion says of the camera. ``offset_s`` is
+    the delay of the camera that the run uses.
     """
-    found = register(edge_scores(sequence, path))
-    if found is None or found.strength < MIN_STRENGTH:
+    found = register(scores)
+    if found is None or found.strength < MIN_STRENGTH or not _is_surely_late(found):
         return None
-    return found if _is_surely_late(found) else None
+    found_s, bound_s = round(offset_s + found.delay_s, 4), NORMAL_95 * found.delay_sigma_s
+    shown = f"colour-depth delay {1e3 * found_s:.1f} ± {1e3 * bound_s:.1f} ms by edges of depth"
+    camera = replace(state.camera, depth_time_offset_s=found_s)
+    return replace(state, camera=camera, text=f"{shown}: found and applied")
 
 
 def stored_problem(run: SavedRun) -> CalibrationProblem | None:

@@ -46,27 +46,57 @@ class EdgeImages:
     colour: tuple[Floats, Floats]
 
 
+@dataclass(frozen=True, eq=False)
+class FrameEdges:
+    """How the edges of a frame's depth fit those of its colour.
+
+    Attributes:
+        scores: (2R + 1, 2R + 1) of the shifts of depth by -R to R steps, rows first.
+        points: (n, 3) in m, some of the edges of depth in the camera's frame.
+        lag_s: time of the depth image less that of the colour image, by stamps and camera.
+    """
+
+    scores: Floats
+    points: Array
+    lag_s: float
+
+    @classmethod
+    def of(cls, rgb: Image, depth_m: Array, lag_s: float, camera: Camera) -> FrameEdges:
+        """Those of a colour image (H, W, 3) and a depth image (H, W), NaN where missing."""
+        edges = edges_of(rgb, depth_m)
+        scores = correlation(edges, _step_px(camera)).astype(np.float32)
+        return cls(scores, _edge_points(edges, depth_m, camera), lag_s)
+
+
 def edge_scores(sequence: Sequence, path: Trajectory) -> EdgeScores:
     """Scores of FRAMES frames of a sequence, spread over the frames that have poses and velocities.
 
     Depth images are taken as they are, so that the lags are those of their stamps.
     """
     chosen, twists = _chosen_frames(sequence, path)
-    camera = sequence.camera
-    step = max(round(camera.width / WIDTH_STEPS), 1)
-    scores, flows = [], []
-    for i, twist in zip(chosen.tolist(), twists, strict=True):
-        depth_m = sequence.recording.read_depth(sequence.pairs.depth_files[i], camera).astype(float)
-        edges = edges_of(sequence.recording.read_rgb(sequence.pairs.rgb_files[i], camera), depth_m)
-        scores.append(correlation(edges, step))
-        flows.append(_flow(edges, depth_m, twist, camera))
+    recording, pairs, camera = sequence.recording, sequence.pairs, sequence.camera
+    frames = []
+    for i in chosen.tolist():
+        depth_m = recording.read_depth(pairs.depth_files[i], camera).astype(float)
+        rgb = recording.read_rgb(pairs.rgb_files[i], camera)
+        frames.append(FrameEdges.of(rgb, depth_m, float(pairs.lags_s[i]), camera))
+    return scores_of(frames, twists, camera)
+
+
+def scores_of(frames: list[FrameEdges], twists: Array, camera: Camera) -> EdgeScores:
+    """Scores of n frames of a camera that moved with twists (n, 6)."""
     size = 2 * RADIUS + 1
+    flows = [_flow(f.points, twist, camera) for f, twist in zip(frames, twists, strict=True)]
     return EdgeScores(
-        np.array(scores).reshape(-1, size, size),
-        float(step),
+        np.array([f.scores for f in frames], np.float64).reshape(-1, size, size),
+        float(_step_px(camera)),
         np.array(flows).reshape(-1, 2),
-        sequence.pairs.lags_s[chosen],
+        np.array([f.lag_s for f in frames]),
     )
+
+
+def _step_px(camera: Camera) -> int:
+    return max(round(camera.width / WIDTH_STEPS), 1)
 
 
 def best_scale(sequence: Sequence, path: Trajectory) -> tuple[float, float]:
@@ -76,7 +106,7 @@ def best_scale(sequence: Sequence, path: Trajectory) -> tuple[float, float]:
     """
     chosen, _ = _chosen_frames(sequence, path)
     camera = sequence.camera
-    step = 2 * max(round(camera.width / WIDTH_STEPS), 1)
+    step = 2 * _step_px(camera)
     total = np.zeros((len(SCALES), 2 * RADIUS + 1, 2 * RADIUS + 1))
     for i in chosen[::2].tolist():
         depth_m = sequence.recording.read_depth(sequence.pairs.depth_files[i], camera).astype(float)
@@ -162,14 +192,18 @@ def _scaled(edges: EdgeImages, scale: float) -> EdgeImages:
     return EdgeImages((first, second), edges.colour)
 
 
-def _flow(edges: EdgeImages, depth_m: Array, twist: Array, camera: Camera) -> Array:
-    """Velocity (2,) of the image in px/s at the edges of depth: the median."""
+def _edge_points(edges: EdgeImages, depth_m: Array, camera: Camera) -> Array:
+    """Some points (n, 3) of the edges of depth."""
     rows, columns = np.nonzero((edges.depth[0] + edges.depth[1] > 0) & np.isfinite(depth_m))
     some = slice(None, None, max(len(rows) // FLOW_POINTS, 1))
     pixels = np.column_stack([columns, rows])[some].astype(float)
-    if not len(pixels):
+    return camera.backproject(pixels, depth_m[rows, columns][some])
+
+
+def _flow(points: Array, twist: Array, camera: Camera) -> Array:
+    """Velocity (2,) of the image in px/s at points (n, 3): the median."""
+    if not len(points):
         return np.zeros(2)
-    points = camera.backproject(pixels, depth_m[rows, columns][some])
     moved = velocities(points, twist)
     slopes = (moved[:, :2] - points[:, :2] / points[:, 2:] * moved[:, 2:]) / points[:, 2:]
-    return np.median(slopes * (camera.fx, camera.fy), axis=0)
+    return np.asarray(np.median(slopes * (camera.fx, camera.fy), axis=0))

@@ -268,6 +268,7 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
         submap_points=POINTS if ros2_of(source) is not None else 0,
         calibrate=arguments.calibrate,
         straightens=True,
+        pairs=source.pairs,
         interpolates=source.interpolates,
         workstation=_workstation_of(arguments),
     )

@@ -55,8 +55,10 @@ class LiveOptions:
             ``auto`` uses what is found, ``report`` only says so, ``off``.
         straightens: whether the source straightens depth by `LiveSlam.camera`, also one that is
             found; if not, a bend of depth that is found is not used.
-        interpolates: whether it gives depth at the colour image's time by that camera; if not, a
-            delay of depth that is found is not used.
+        pairs: whether it pairs images by that camera; if not, a delay of depth that edges show to
+            be larger than any camera's is not used.
+        interpolates: whether it gives depth at the colour image's time by that camera; if not, no
+            other delay that is found is used.
         workstation: another machine, which has the map and makes the masks.
     """
 
@@ -72,6 +74,7 @@ class LiveOptions:
     submap_points: int = 0
     calibrate: str = "off"
     straightens: bool = False
+    pairs: bool = False
     interpolates: bool = False
     workstation: Workstation | None = None
 
@@ -95,7 +98,8 @@ def start_calibration(
     if options.straightens:
         free.extend(BENDS)
     rules = SelfCalibrationConfig()
-    setup = CalibrationSetup(camera, config.graph, rules, options.calibrate, tuple(free))
+    follows = tuple(free), options.pairs
+    setup = CalibrationSetup(camera, config.graph, rules, options.calibrate, *follows)
     return RemoteCalibration(setup)
 
 

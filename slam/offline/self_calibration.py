@@ -30,7 +30,8 @@ from bmask_slam.calibration.adoption import (
     format_found,
     judged,
 )
-from bmask_slam.calibration.camera_check import NORMAL_95, sure_delay
+from bmask_slam.calibration.camera_check import with_sure_delay
+from bmask_slam.calibration.edge_scores import edge_scores
 from bmask_slam.calibration.keyframe_motions import (
     depth_change_between,
     frame_motions,
@@ -116,25 +117,15 @@ class SelfCalibrator:
         return True
 
     def _by_edges(self, system: System, sequence: Sequence) -> SelfCalibration | None:
-        """The state with the delay of depth that edges show, if that is far from a right camera's.
-
-        So large a delay bends the map, and with it what the motion says of the camera.
-        """
+        """The state with a delay of depth that its edges show, if that is large."""
         if self._mode != "auto" or self.state.adopted or not isinstance(system, SlamSystem):
             return None
-        path = system.as_run().trajectories["trajectory.txt"]
         try:
-            found = sure_delay(path, sequence)
+            scores = edge_scores(sequence, system.as_run().trajectories["trajectory.txt"])
         except InputError as error:
             logger.info("calibration: %s", error)
             return None
-        if found is None:
-            return None
-        offset_s = round(sequence.camera.depth_time_offset_s + found.delay_s, 4)
-        bound_ms = 1e3 * NORMAL_95 * found.delay_sigma_s
-        text = f"colour-depth delay {1e3 * offset_s:.1f} ± {bound_ms:.1f} ms by edges of depth"
-        camera = replace(self.state.camera, depth_time_offset_s=offset_s)
-        return replace(self.state, camera=camera, text=f"{text}: found and applied")
+        return with_sure_delay(self.state, scores, sequence.camera.depth_time_offset_s)
 
     def _by_motion(self, system: System, sequence: Sequence) -> SelfCalibration:
         """The state with what observations and depths of the map show."""

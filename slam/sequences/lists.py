@@ -20,6 +20,8 @@ logger = logging.getLogger(__name__)
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 MAX_DEPTH_STEP_S = 0.1
 """Largest time between two depth images for interpolation between them."""
+HALF_INTERVAL = 0.55
+"""Of the interval between depth images: stamps are not quite regular."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,12 +124,15 @@ def pair_images(
 ) -> ImagePairs:
     """Pair colour and depth one to one by nearest stamp.
 
-    The capture time of a depth image, by which it is paired, is its stamp plus the offset.
+    The capture time of a depth image, by which it is paired, is its stamp plus the offset. With an
+    offset no colour image lies further than half an interval from depth, whatever the limit.
 
     Raises:
         InputError: no two stamps within the limit; ``folder`` begins the text.
     """
     depth_s = depth.timestamps_s + depth_time_offset_s
+    if depth_time_offset_s:
+        max_difference_s = max(max_difference_s, half_interval_s(np.diff(depth_s)))
     i, j = associate_stamps(rgb.timestamps_s, depth_s, max_difference_s)
     if not len(i):
         raise InputError(
@@ -147,6 +152,11 @@ def pair_images(
         len(rgb.files) - len(i),
         len(depth.files) - len(j),
     )
+
+
+def half_interval_s(steps_s: Array) -> float:
+    """A little more than half of the usual step (N,) of depth images; 0 without any."""
+    return HALF_INTERVAL * float(np.median(steps_s)) if len(steps_s) else 0.0
 
 
 def _neighbours(depth_s: Array, chosen: Ints, lags_s: Array) -> tuple[Ints, Array]:

@@ -21,8 +21,11 @@ from bmask_slam.calibration.adoption import (
     format_found,
     judged,
 )
+from bmask_slam.calibration.camera_check import with_sure_delay
+from bmask_slam.calibration.edge_scores import scores_of
 from bmask_slam.calibration.keyframe_depth import KeptDepths, KeyframeDepth, KeyframeImages
 from bmask_slam.calibration.keyframe_motions import keyframe_motions
+from bmask_slam.calibration.motion import twists_at
 from bmask_slam.calibration.rematching import estimate_again
 from bmask_slam.calibration.views import sensor_sigmas
 from bmask_slam.graph.arrays import Array, Ints, no_ids
@@ -58,6 +61,7 @@ class CalibrationSetup:
         mode: "auto": what is sure is adopted; "report": it is only said.
         free: the parameters that may be used, by their places in PARAMETERS: those that the
             source's frames follow.
+        pairs: whether the source pairs images by the camera's delay of depth.
     """
 
     camera: Camera
@@ -65,6 +69,7 @@ class CalibrationSetup:
     config: SelfCalibrationConfig
     mode: str
     free: tuple[int, ...]
+    pairs: bool
 
 
 def serve_calibration(channel: Channel, setup: CalibrationSetup, niceness: int) -> None:
@@ -90,7 +95,7 @@ class CalibrationServer:
 
     def add(self, images: KeyframeImages) -> None:
         """Keep what is needed of a keyframe's depth images."""
-        self._depths[images.id] = KeyframeDepth.of(images)
+        self._depths[images.id] = KeyframeDepth.of(images, self._setup.camera)
         if len(self._depths) > MAX_IMAGES:
             del self._depths[min(self._depths)]
 
@@ -109,12 +114,30 @@ class CalibrationServer:
         if estimate is not None:
             logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
             state = judged(self._state, estimate, setup.mode, config, setup.free)
+        if not state.adopted and (late := self._by_edges(run, world, kept)) is not None:
+            self._state = late
+            motions = self._motions(world, paths, run, late.camera)
+            return CameraEstimated(late.camera, motions, late.text, False)
         self._state = state
-        if state.adopted:
+        if state.adopted and state.camera != run.camera:
             motions = self._motions(world, paths, run, state.camera)
             return CameraEstimated(state.camera, motions, state.text, True)
-        done = state.settled or state.looks >= config.stretches
+        done = state.adopted or state.settled or state.looks >= config.stretches
         return CameraEstimated(None, {}, state.text, done)
+
+    def _by_edges(
+        self, run: SavedRun, world: WorldMap, kept: dict[int, KeyframeDepth]
+    ) -> SelfCalibration | None:
+        """The state with a delay of depth that its edges show, if that is large."""
+        path = run.trajectories["trajectory.txt"]
+        if self._setup.mode != "auto" or not self._setup.pairs or not len(path):
+            return None
+        stamps_s = np.array([world.keyframes[k].timestamp_s for k in kept])
+        twists = twists_at(path, stamps_s)
+        moving = np.flatnonzero(twists.any(axis=1))
+        edges = [depth.edges for depth in kept.values()]
+        scores = scores_of([edges[i] for i in moving.tolist()], twists[moving], run.camera)
+        return with_sure_delay(self._state, scores, run.camera.depth_time_offset_s)
 
     def _motions(
         self, world: WorldMap, paths: dict[int, Trajectory], run: SavedRun, camera: Camera

@@ -1,8 +1,8 @@
 """Tracking's side of calibration: when the camera is estimated, and what came of it.
 
-The process gets the depth images around each keyframe. After so many frames with one camera the
-map's process is asked for a state, and the calibration's process estimates from that. Neither
-tracking nor the map waits for it, and a process that dies is not started again.
+The process gets each keyframe's images, and the depth images around it. After so many frames with
+one camera the map's process is asked for a state, and the calibration's process estimates from
+that. Neither tracking nor the map waits for it, and a process that dies is not started again.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import threading
 from dataclasses import dataclass
 
 from bmask_slam.calibration.keyframe_depth import DepthImage, KeyframeImages
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.live.messages import CameraEstimated, EstimateCamera
 from bmask_slam.live.processes.calibration_process import CalibrationSetup
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
@@ -31,6 +31,7 @@ class _Pending:
     """A keyframe that waits for the depth image after it."""
 
     id: int
+    rgb: Image
     pixels: Array
     lag_s: float
 
@@ -72,12 +73,13 @@ class RemoteCalibration:
         self._last = [*self._last[-2:], DepthImage(frame.depth_m.copy(), taken_s)]
         before, pending = self._last[:-1], self._pending
         if pending is not None and len(before) == 2:
+            about = pending.id, pending.rgb, pending.pixels
             images = before[1], before[0], self._last[-1]
-            self._worker.send(KeyframeImages(pending.id, pending.pixels, *images, pending.lag_s))
+            self._worker.send(KeyframeImages(*about, *images, pending.lag_s))
         self._pending = None
         if keyframe is not None and before:
             pixels = keyframe.features.image_pixels
-            self._pending = _Pending(keyframe.id, pixels, frame.depth_lag_s)
+            self._pending = _Pending(keyframe.id, frame.rgb.copy(), pixels, frame.depth_lag_s)
 
     def update(self, mapper: RemoteMapper) -> CameraEstimated | None:
         """Ask for an estimate when it is due; returns one that has come."""

@@ -24,6 +24,8 @@ class BagSource(MeasuredSource):
         waits: see ``Source``; False if ``realtime``.
     """
 
+    pairs = True
+
     def __init__(
         self,
         path: Path,
@@ -59,7 +61,7 @@ class BagSource(MeasuredSource):
         return message_frames(self._pairs(), lambda: self.camera, self._found, self.counts, names)
 
     def _pairs(self) -> Iterator[Pair[Any]]:
-        pairer = Pairer[Any](self.counts, self.camera.depth_time_offset_s)
+        pairer = Pairer[Any](self.counts, lambda: self.camera.depth_time_offset_s)
         with open_bag(self._path) as bag:
             for name, message in bag.messages(self._topics.rgb, self._topics.depth):
                 stream = RGB if name == self._topics.rgb else DEPTH

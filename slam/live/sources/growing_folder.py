@@ -102,6 +102,8 @@ class GrowingFolder(MeasuredSource):
         waits: False: frames that tracking has no time for are dropped, as with a camera.
     """
 
+    pairs = True
+
     waits = False
 
     def __init__(
@@ -121,8 +123,9 @@ class GrowingFolder(MeasuredSource):
         self._closed = threading.Event()
         self.camera, lists = self._await(camera)
         self._lists = [ListFollower(path) for path in lists]
-        offset_s = self.camera.depth_time_offset_s
-        self._pairer = Pairer[Path](self.counts, offset_s, max_waiting=_MAX_LINES)
+        self._pairer = Pairer[Path](
+            self.counts, lambda: self.camera.depth_time_offset_s, max_waiting=_MAX_LINES
+        )
         self._first_s: list[float] = []
 
     def frames(self) -> Iterator[Frame]:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 from bisect import bisect_right
 from collections import deque
+from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from bmask_slam.graph.trajectory import associate_stamps, nearest_indices
 from bmask_slam.live.sources.source import SourceCounts
+from bmask_slam.sequences.lists import half_interval_s
 
 logger = logging.getLogger(__name__)
 
@@ -125,6 +127,9 @@ class Pairer(Generic[T]):
     those of ``associate_stamps`` over all stamps, unless the streams step by less than
     ``max_difference_s``.
 
+    ``depth_offset_s()`` is what depth is later than its stamps; it may change on the way. With one
+    the limit is at least half of the interval between depth images, so that each finds a partner.
+
     Attributes:
         clock: of both streams.
     """
@@ -132,12 +137,13 @@ class Pairer(Generic[T]):
     def __init__(
         self,
         counts: SourceCounts,
-        depth_offset_s: float = 0.0,
+        depth_offset_s: Callable[[], float] = lambda: 0.0,
         max_difference_s: float = MAX_DIFFERENCE_S,
         max_waiting: int = MAX_WAITING,
     ) -> None:
         self._counts, self._max_s, self._max_waiting = counts, max_difference_s, max_waiting
-        self._offsets_s = (0.0, depth_offset_s)
+        self._depth_offset_s, self._offsets_s = depth_offset_s, (0.0, depth_offset_s())
+        self._least_s, self._steps_s = max_difference_s, deque[float](maxlen=USUAL_FRAMES)
         self.clock, self._gaps = StreamClock(counts), GapMeter(counts)
         self._waiting: tuple[deque[tuple[float, T]], ...] = (deque(), deque())
         self._heard_s = [-np.inf, -np.inf]
@@ -147,13 +153,26 @@ class Pairer(Generic[T]):
         placed_s = self.clock.map_stamp(stream, stamp_s)
         if placed_s is None:
             return []
+        self._move_depth(self._depth_offset_s())
         placed_s += self._offsets_s[stream]
+        if stream == DEPTH and np.isfinite(self._heard_s[DEPTH]):
+            self._steps_s.append(placed_s - self._heard_s[DEPTH])
+            half_s = half_interval_s(np.array(self._steps_s)) if self._offsets_s[DEPTH] else 0.0
+            self._max_s = max(self._least_s, half_s)
         self._heard_s[stream] = placed_s
         self._waiting[stream].append((placed_s, item))
         pairs = self._final_pairs()
         for each in (RGB, DEPTH):
             self._discard(each)
         return pairs
+
+    def _move_depth(self, offset_s: float) -> None:
+        """Place the depth images that wait by another offset, if it is another."""
+        change_s = offset_s - self._offsets_s[DEPTH]
+        if change_s:
+            waiting = deque((stamp_s + change_s, item) for stamp_s, item in self._waiting[DEPTH])
+            self._waiting, self._offsets_s = (self._waiting[RGB], waiting), (0.0, offset_s)
+            self._heard_s[DEPTH] += change_s
 
     def finish(self) -> list[Pair[T]]:
         """The remaining pairs, when no further image will come."""

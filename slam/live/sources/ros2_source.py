@@ -129,6 +129,8 @@ class Ros2Source(MeasuredSource):
             frames that came with them.
     """
 
+    pairs = True
+
     waits = False
 
     def __init__(self, node: Node, name: str, options: Ros2Options) -> None:
@@ -155,7 +157,7 @@ class Ros2Source(MeasuredSource):
         self._frame = first_message(heard, self._topics.rgb).header.frame_id.lstrip("/")
         self._heard.keep(TRANSFORMS)
         self._robot = RobotFrames(self.node, name, self._heard.static)
-        self._pairer = Pairer[Any](self.counts, self.camera.depth_time_offset_s)
+        self._pairer = Pairer[Any](self.counts, lambda: self.camera.depth_time_offset_s)
         kinds, quality = self.node.published(), options.image_quality
         names = (self._topics.rgb, self._topics.depth)
         self._readers = [self.node.reader(name, kinds[name], quality) for name in names]

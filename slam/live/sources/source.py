@@ -67,6 +67,7 @@ class Source(Protocol):
         counts: what was received that did not become a frame.
         waits: True: each frame waits until the consumer asks for it, as in a recording that is
             played as fast as possible. False: frames come at their own rate, as a camera's do.
+        pairs: whether images are paired by the camera's delay of depth.
         interpolates: whether depth is that at the colour image's time, by the camera's delay.
     """
 
@@ -75,6 +76,7 @@ class Source(Protocol):
     groundtruth: Trajectory | None
     counts: SourceCounts
     waits: bool
+    pairs: bool
     interpolates: bool
 
     def use(self, camera: Camera) -> None:
@@ -91,7 +93,7 @@ class MeasuredSource:
     """A source that gives depth as it was measured, straightened by its camera."""
 
     camera: Camera
-    interpolates = False
+    pairs = interpolates = False
 
     def use(self, camera: Camera) -> None:
         """Straighten the depth of later frames by another camera, from any thread."""
@@ -101,7 +103,7 @@ class MeasuredSource:
 class RecordedSource:
     """A recorded sequence, at the rate of its stamps if ``realtime``."""
 
-    interpolates = True
+    pairs = interpolates = True
 
     def __init__(self, sequence: Sequence, realtime: bool) -> None:
         self.name, self.camera = sequence.name, sequence.camera
@@ -148,7 +150,8 @@ class Limited:
         self.name, self.camera = source.name, source.camera
         self.groundtruth = source.groundtruth
         self.counts, self.waits = source.counts, source.waits
-        self.use, self.interpolates = source.use, source.interpolates
+        self.use = source.use
+        self.pairs, self.interpolates = source.pairs, source.interpolates
         self.source, self._max_frames = source, max_frames
 
     def frames(self) -> Iterator[Frame]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from faults import LONG_S
+from recorded_bags import DEPTH, INFO, RGB, BagMaker, image
 
 from bmask_slam.calibration.adoption import SelfCalibrationConfig
 from bmask_slam.config.configuration import resolve
@@ -17,6 +20,7 @@ from bmask_slam.live import play as play_module
 from bmask_slam.live.live_slam import LiveSlam
 from bmask_slam.live.play import PlayOptions, play
 from bmask_slam.live.processes import remote_calibration
+from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.source import RecordedSource
 from bmask_slam.live.start import LiveOptions
 from bmask_slam.run_folder.map_file import read_map, read_run
@@ -28,10 +32,12 @@ CONFIG = resolve(
     SystemConfig, None, ("semantics.segmenter.name=none", "features.max_keypoints=400")
 )
 
+STEP_S = 1 / 15
+
 
 def played(sequence: Sequence, out: Path, calibrate: str) -> LiveSlam:
     source = RecordedSource(sequence, realtime=False)
-    options = LiveOptions(out, calibrate=calibrate, straightens=True, interpolates=True)
+    options = LiveOptions(out, calibrate=calibrate, straightens=True, pairs=True, interpolates=True)
     with LiveSlam(source.camera, CONFIG, options) as slam:
         assert play(slam, source, PlayOptions(realtime=False, quiet=True)) is None
     assert source.camera == slam.camera
@@ -61,6 +67,43 @@ def test_a_delay_is_found_and_used(late_sweep, sweep_camera, short_stretch, tmp_
     told = played(late, tmp_path / "told", "report")
     assert told.calibration.endswith("found, not applied")
     assert told.camera.depth_time_offset_s == 0 and not (tmp_path / "told/camera.yaml").exists()
+
+
+def test_a_source_that_pairs_images_gets_the_delay_that_edges_show(
+    late_sweep, sweep_camera, short_stretch, monkeypatch, tmp_path
+) -> None:
+    monkeypatch.setattr(start, "SelfCalibrationConfig", partial(SelfCalibrationConfig, frames=80))
+    source, lags_s = BagSource(one_frame_late(late_sweep, tmp_path / "late.bag")), []
+    assert source.pairs and not source.interpolates
+    options = LiveOptions(tmp_path / "run", calibrate="auto", straightens=True, pairs=True)
+    with LiveSlam(source.camera, CONFIG, options) as slam:
+        for frame in source.frames():
+            slam.track(frame.timestamp_s, frame.rgb, frame.depth_m, depth_lag_s=frame.depth_lag_s)
+            slam.catch_up(waiting=0)
+            source.use(slam.camera)
+            lags_s.append(frame.depth_lag_s)
+    right_s = sweep_camera.depth_time_offset_s - STEP_S
+    assert slam.camera.depth_time_offset_s == pytest.approx(right_s, abs=0.01)
+    assert "by edges of depth: found and applied" in (tmp_path / "run/log.txt").read_text()
+    assert lags_s[:80] == pytest.approx([0.0] * 80, abs=1e-5)
+    assert lags_s[-10:] == pytest.approx([STEP_S] * 10, abs=1e-5)
+
+
+def one_frame_late(folder: Path, path: Path) -> Path:
+    """A bag of a sequence, in which each depth image has the stamp of the next colour image."""
+    sequence = open_sequence(folder)
+    camera = sequence.camera
+    k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1])
+    p = np.insert(k, (3, 6, 9), 0.0)
+    size = {"width": camera.width, "height": camera.height}
+    about = SimpleNamespace(**size, k=k, p=p, d=np.zeros(5), distortion_model="plumb_bob")
+    with closing(sequence.frames()) as frames, BagMaker(path, "sqlite3") as bag:
+        bag.write(INFO, 100.0, about)
+        for frame in frames:
+            stamp_s = 100 + frame.timestamp_s
+            bag.write(RGB, stamp_s, image("rgb8", frame.rgb))
+            bag.write(DEPTH, stamp_s + STEP_S, image("32FC1", frame.depth_m))
+    return path
 
 
 def test_a_right_camera_stays(late_sweep, sweep_camera, short_stretch, tmp_path) -> None:

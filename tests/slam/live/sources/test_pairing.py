@@ -75,12 +75,34 @@ def test_images_too_far_apart_in_time_are_not_paired() -> None:
 
 
 def test_a_known_delay_of_depth_is_added_to_its_stamps() -> None:
-    pairer = Pairer[str](SourceCounts(), depth_offset_s=-0.05)
+    pairer = Pairer[str](SourceCounts(), depth_offset_s=lambda: -0.05)
     assert not pairer.add(RGB, 1.00, "c0")
     assert not pairer.add(DEPTH, 1.00, "of 0.95")
     (pair,) = pairer.add(DEPTH, 1.05, "of 1.00")
     assert pair[:3] == (1.00, "c0", "of 1.00")
     assert pair.lag_s == pytest.approx(0.05)  # of the stamps
+
+
+def test_a_delay_that_is_found_on_the_way_pairs_the_images_that_wait_too() -> None:
+    known_s, pairs = [0.0], []
+    pairer = Pairer[int](SourceCounts(), depth_offset_s=lambda: known_s[0])
+    for k in range(8):
+        if k == 4:
+            known_s[0] = -0.2  # as of the depth image two frames later
+        pairs += pairer.add(RGB, k / 10, k) + pairer.add(DEPTH, k / 10, k)
+    pairs += pairer.finish()
+    assert [(pair.rgb, pair.depth) for pair in pairs[:4]] == [(k, k) for k in range(4)]
+    assert [(pair.rgb, pair.depth) for pair in pairs[4:]] == [(4, 6), (5, 7)]
+    assert [pair.lag_s for pair in pairs[4:]] == pytest.approx([0.2, 0.2])
+
+
+def test_with_a_known_delay_images_half_an_interval_apart_are_paired() -> None:
+    counts, pairs = SourceCounts(), []
+    pairer = Pairer[int](counts, depth_offset_s=lambda: -0.049)
+    for k in range(20):
+        pairs += pairer.add(RGB, k / 10, k) + pairer.add(DEPTH, k / 10, k)
+    assert [pair.depth - pair.rgb for pair in pairs[2:]] == [0] * len(pairs[2:])
+    assert len(pairs) >= 16 and counts.unpaired_rgb <= 3
 
 
 def test_duplicates_and_late_images_are_skipped_and_counted() -> None:
