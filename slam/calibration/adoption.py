@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 TIMES = (SHUTTER, TIME)
 BENDS = tuple(range(len(PARAMETERS))[BEND])
-FREE = (*TIMES, *BENDS)
+FREE = (*TIMES, *BENDS)  # what is estimated, by places in PARAMETERS
 CALIBRATE = ("auto", "report", "off")
 """Whether what is found is used, only told, or not looked for."""
 NAMES = {SHUTTER: "rolling shutter", TIME: "colour-depth delay"}
@@ -182,7 +182,7 @@ def _rms(bend: Array) -> float:
 
 
 def _rms_sigma(sigmas: Array) -> float:
-    """Of a distortion with those (5,) of its coefficients, in 1/m."""
+    """Standard deviation of a distortion with those (5,) of its coefficients, in 1/m."""
     return float(np.sqrt(np.mean(BEND_TERMS**2 @ sigmas**2)))
 
 

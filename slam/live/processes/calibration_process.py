@@ -18,6 +18,7 @@ from bmask_slam.calibration.adoption import (
     FREE,
     SelfCalibration,
     SelfCalibrationConfig,
+    adopted_parameters,
     format_found,
     judged,
 )
@@ -29,6 +30,7 @@ from bmask_slam.calibration.motion import twists_at
 from bmask_slam.calibration.rematching import estimate_again
 from bmask_slam.calibration.views import sensor_sigmas
 from bmask_slam.graph.arrays import Array, Ints, no_ids
+from bmask_slam.graph.calibration.model import TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
@@ -114,11 +116,11 @@ class CalibrationServer:
         if estimate is not None:
             logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
             state = judged(self._state, estimate, setup.mode, config, setup.free)
-        if not state.adopted and (late := self._by_edges(run, world, kept)) is not None:
-            self._state = late
+        late = None if TIME in adopted_parameters(state) else self._by_edges(run, world, kept)
+        self._state = late or state
+        if late is not None:
             motions = self._motions(world, paths, run, late.camera)
             return CameraEstimated(late.camera, motions, late.text, False)
-        self._state = state
         if state.adopted and state.camera != run.camera:
             motions = self._motions(world, paths, run, state.camera)
             return CameraEstimated(state.camera, motions, state.text, True)
@@ -130,7 +132,8 @@ class CalibrationServer:
     ) -> SelfCalibration | None:
         """The state with a delay of depth that its edges show, if that is large."""
         path = run.trajectories["trajectory.txt"]
-        if self._setup.mode != "auto" or not self._setup.pairs or not len(path):
+        looks = self._setup.mode == "auto" and self._setup.pairs and not self._state.adopted
+        if not looks or not len(path):
             return None
         stamps_s = np.array([world.keyframes[k].timestamp_s for k in kept])
         twists = twists_at(path, stamps_s)

@@ -102,9 +102,7 @@ class GrowingFolder(MeasuredSource):
         waits: False: frames that tracking has no time for are dropped, as with a camera.
     """
 
-    pairs = True
-
-    waits = False
+    pairs, waits = True, False
 
     def __init__(
         self, folder: Path, camera: Path | None = None, options: FollowOptions | None = None

@@ -129,9 +129,7 @@ class Ros2Source(MeasuredSource):
             frames that came with them.
     """
 
-    pairs = True
-
-    waits = False
+    pairs, waits = True, False
 
     def __init__(self, node: Node, name: str, options: Ros2Options) -> None:
         """Wait until somebody publishes the images and their camera, and the sensors' topics.
