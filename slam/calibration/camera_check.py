@@ -39,6 +39,7 @@ MAX_SHIFT_SHARE = 4 / 640
 """Of the image's width."""
 MIN_STRENGTH, MIN_STRENGTH_RATIO, MIN_SCALE_CHANGE = 6.0, 1.5, 0.05
 MAX_DELAY_S, SURE_DELAY_S, MAX_DELAY_BOUND_S = 0.022, 0.015, 0.015
+LARGE_DELAY_S = 0.035
 GAUGE_SIGMAS = np.full(6, 1e-4)
 SCALE_NOTE = (
     "depth scale: not observable, images and depth fit a world of any size; bmask-slam calibrate "
@@ -99,11 +100,14 @@ def with_sure_delay(
 ) -> SelfCalibration | None:
     """The state with the delay of depth that edges show, if it is far from a right camera's.
 
-    So large a delay bends the map, and with it what the motion says of the camera. ``offset_s`` is
-    the delay of the camera that the run uses.
+    So large a delay bends the map, and with it what the motion says of the camera; smaller ones are
+    left to that, since edges may deceive where a camera turns evenly: a delay moves them as another
+    place of the depth camera does. ``offset_s`` is the delay of the camera that the run uses.
     """
     found = register(scores)
-    if found is None or found.strength < MIN_STRENGTH or not _is_surely_late(found):
+    if found is None or found.strength < MIN_STRENGTH:
+        return None
+    if abs(found.delay_s) - NORMAL_95 * found.delay_sigma_s < LARGE_DELAY_S:
         return None
     found_s, bound_s = round(offset_s + found.delay_s, 4), NORMAL_95 * found.delay_sigma_s
     shown = f"colour-depth delay {1e3 * found_s:.1f} ± {1e3 * bound_s:.1f} ms by edges of depth"
@@ -196,14 +200,9 @@ def _delay(found: Registration, camera: Camera) -> _Finding:
     )
     later = "later" if delay_s > 0 else "earlier"
     shown = f"{1e3 * abs(delay_s):.0f} ± {1e3 * bound_s:.0f} ms {later} than stamps and camera say"
-    if _is_surely_late(found):
+    if abs(delay_s) > MAX_DELAY_S and abs(delay_s) - bound_s > SURE_DELAY_S:
         cure = f"set depth_time_offset: {camera.depth_time_offset_s + delay_s:.3f} in camera.yaml"
         return _Finding(f"stamps: depth images are {shown}; {cure}", True, rows)
     if bound_s > MAX_DELAY_BOUND_S:
         return _Finding(f"stamps: delay of depth not observable in this motion ({shown})")
     return _Finding(f"stamps: depth images are {shown}", rows=rows)
-
-
-def _is_surely_late(found: Registration) -> bool:
-    delay_s, bound_s = abs(found.delay_s), NORMAL_95 * found.delay_sigma_s
-    return delay_s > MAX_DELAY_S and delay_s - bound_s > SURE_DELAY_S

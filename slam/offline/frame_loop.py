@@ -140,10 +140,12 @@ def process_frames(run: ActiveRun) -> bool:
 
 
 def write_found_camera(run: ActiveRun) -> None:
-    """Write the camera that was found, if one was."""
+    """Write the camera that was found; without one, take back that of an earlier beginning."""
     found = run.calibrator.state
     if found.adopted:
         run.folder.write_text(CAMERA, format_camera(found.camera, found.text))
+    else:
+        run.folder.remove_text(CAMERA)
 
 
 def _plain(run: ActiveRun) -> Generator[tuple[Frame], None, None]:

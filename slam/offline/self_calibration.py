@@ -7,7 +7,8 @@ those of a published calibration are better than what a short stretch shows, and
 depth scale, which images and depths alone do not show, would be taken for one of theirs. A readout
 time that the camera has is kept. Whether they are adopted is decided in `calibration.adoption`. If
 none is, the run goes on; else it begins anew, once, with the camera that was found. If edges of
-depth show a delay that no right camera has, it begins anew with that before (`camera_check`).
+depth show a delay that is far from a right camera's, it begins anew with that before
+(`calibration.camera_check`).
 
 After the last frame such a run is looked at once more. Its map shows more than the first stretch,
 and was not bent by the wrong camera. The keyframes are interpreted anew with what is found then,
@@ -40,6 +41,7 @@ from bmask_slam.calibration.keyframe_motions import (
 from bmask_slam.calibration.rematching import estimate_again
 from bmask_slam.calibration.views import SequenceDepths
 from bmask_slam.graph.arrays import Array, Ints, no_ids
+from bmask_slam.graph.calibration.model import TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.labelling.mask_memory import MaskMemory
@@ -49,6 +51,9 @@ from bmask_slam.system_interface import System
 from bmask_slam.world.keyframe import Keyframe
 
 logger = logging.getLogger(__name__)
+
+OTHER_DELAY_S = 0.01
+"""Edges and motion may differ by so much."""
 
 
 class SelfCalibrator:
@@ -128,12 +133,26 @@ class SelfCalibrator:
         return with_sure_delay(self.state, scores, sequence.camera.depth_time_offset_s)
 
     def _by_motion(self, system: System, sequence: Sequence) -> SelfCalibration:
-        """The state with what observations and depths of the map show."""
+        """The state with what observations and depths of the map show.
+
+        A delay that edges showed is taken back if the motion contradicts it.
+        """
         before, estimate = self.state, self._estimate(system, sequence)
         if estimate is None:
             return replace(before, looks=before.looks + 1)
         found = judged(before, estimate, self._mode, self._config)
-        return replace(found, settled=True) if before.adopted else found
+        if not before.adopted:
+            return found
+        if found.camera == before.camera and self._is_other_delay(estimate, found.camera):
+            text = f"{before.text.partition(':')[0]}: the motion contradicts it"
+            return replace(found, camera=before.given, text=text, settled=True)
+        return replace(found, settled=True)
+
+    def _is_other_delay(self, estimate: Estimate, camera: Camera) -> bool:
+        """Whether the motion surely shows another delay of depth than a camera has."""
+        off_s = abs(estimate.found[TIME] - camera.depth_time_offset_s)
+        least_s = max(self._config.min_change_sigmas * estimate.sigmas[TIME], OTHER_DELAY_S)
+        return estimate.shows(TIME, self._config) and bool(off_s > least_s)
 
     def _forget_masks(self) -> None:
         if self._masks is not None and (self.finished or self._mode == "report"):

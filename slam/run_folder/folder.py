@@ -225,6 +225,11 @@ class RunFolder:
         self._files.texts[name] = text
         self.write_file(name, lambda path: path.write_text(text, encoding="utf-8"))
 
+    def remove_text(self, name: str) -> None:
+        """Take back a text file, if there is one."""
+        self._files.texts.pop(name, None)
+        remove(self.path / name)
+
     def write_file(self, name: str, write: Callable[[Path], object]) -> None:
         """Replace a file by what a function writes to another path."""
 

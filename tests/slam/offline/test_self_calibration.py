@@ -144,6 +144,28 @@ def test_depth_of_the_frame_before_is_noticed_by_its_edges_and_cured(
     assert ate_m(done) < 1.2 * ate_m(run(replace(known, calibrate="off")))
 
 
+def test_a_delay_that_edges_showed_is_taken_back_if_the_motion_contradicts_it(
+    late_sweep: Path,
+    sweep_camera: Camera,
+    quick: None,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    def deceived(state: SelfCalibration, *rest: Any) -> SelfCalibration:
+        camera = replace(state.camera, depth_time_offset_s=0.07)
+        return replace(state, camera=camera, text="delay 70.0 ms by edges: found and applied")
+
+    write_camera(tmp_path / "right.yaml", sweep_camera)
+    options = replace(late_options(late_sweep, tmp_path / "off"), camera=tmp_path / "right.yaml")
+    off = run(replace(options, calibrate="off"))
+    monkeypatch.setattr("bmask_slam.offline.self_calibration.with_sure_delay", deceived)
+    done = run(replace(options, out=tmp_path / "run"))
+    assert done.calibration == "delay 70.0 ms by edges: the motion contradicts it"
+    assert not (done.folder / "camera.yaml").exists()
+    for name in ("trajectory.txt", "map", "graph"):
+        assert (done.folder / name).read_bytes() == (off.folder / name).read_bytes(), name
+
+
 def ate_m(done: RunSummary) -> float:
     """Of a run."""
     return float(next(row["value"] for row in done.rows if row["name"] == "ate_rmse"))
