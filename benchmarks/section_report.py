@@ -199,7 +199,8 @@ REPORTS = {
         "hard": ("Hard inputs: never lost", ""),
         "loops": ("Loop closures", "loops.loop_edges --work {sequences}"),
         "wrong": ("Wrong cameras", "suite.wrong_cameras"),
-    }, markdown=frozenset({"table", "orb", "hard", "loops", "wrong"})),
+        "stamps": ("Depth that is off its stamps", ""),
+    }, markdown=frozenset({"table", "orb", "hard", "loops", "wrong", "stamps"})),
 }  # fmt: skip
 
 
