@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.calibration.edge_scores import FrameEdges
 from bmask_slam.calibration.views import (
     MAX_RATE_STEP_S,
     MAX_STEP_SIGMAS,
@@ -37,7 +36,7 @@ class KeyframeImages:
 
     Attributes:
         id: of the keyframe.
-        rgb: (H, W, 3) its colour image.
+        rgb: (H, W, 3) its colour image; (0, W, 3) where nobody looks at its edges.
         pixels: (N, 2) of its keypoints in the image as exposed.
         depth, before, after: three depth images in a row.
         lag_s: as of ``Frame``.
@@ -54,7 +53,7 @@ class KeyframeImages:
 
 @dataclass(frozen=True, eq=False)
 class KeyframeDepth:
-    """What is kept of a keyframe's images: inverse depth (H, W), its rate of change, its edges.
+    """What is kept of a keyframe's depth images: inverse depth (H, W) and its rate of change.
 
     Half precision is a tenth of the sensor's noise.
     """
@@ -63,13 +62,10 @@ class KeyframeDepth:
     inverse_depth: NDArray[np.float16]
     rate: NDArray[np.float16]
     lag_s: float
-    edges: FrameEdges
 
     @classmethod
-    def of(cls, images: KeyframeImages, camera: Camera) -> KeyframeDepth:
-        """By the frame's camera. The rate is NaN where the surface changed, and everywhere if too
-        much time passed.
-        """
+    def of(cls, images: KeyframeImages) -> KeyframeDepth:
+        """The rate is NaN where the surface changed, and everywhere if too much time passed."""
         inverse, first, last = (
             1.0 / image.depth_m for image in (images.depth, images.before, images.after)
         )
@@ -78,9 +74,7 @@ class KeyframeDepth:
         known = 0 < step_s < MAX_RATE_STEP_S
         rate = np.where(changed, np.nan, change / step_s) if known else np.full_like(change, np.nan)
         half = np.float16
-        depth_m, lag_s = images.depth.depth_m.astype(float), images.lag_s
-        edges = FrameEdges.of(images.rgb, depth_m, lag_s + camera.depth_time_offset_s, camera)
-        return cls(images.pixels, inverse.astype(half), rate.astype(half), images.lag_s, edges)
+        return cls(images.pixels, inverse.astype(half), rate.astype(half), images.lag_s)
 
     def sample(self, pixels: Array, sigmas: Array) -> Depths:
         """At pixels (m, 2) as exposed, whose inverse depths have these sigmas (m,) in 1/m."""

@@ -23,7 +23,7 @@ from bmask_slam.calibration.adoption import (
     judged,
 )
 from bmask_slam.calibration.camera_check import with_sure_delay
-from bmask_slam.calibration.edge_scores import scores_of
+from bmask_slam.calibration.edge_scores import FrameEdges, scores_of
 from bmask_slam.calibration.keyframe_depth import KeptDepths, KeyframeDepth, KeyframeImages
 from bmask_slam.calibration.keyframe_motions import keyframe_motions
 from bmask_slam.calibration.motion import twists_at
@@ -73,6 +73,11 @@ class CalibrationSetup:
     free: tuple[int, ...]
     pairs: bool
 
+    @property
+    def looks_at_edges(self) -> bool:
+        """Whether a delay that edges of depth show would be used."""
+        return self.mode == "auto" and self.pairs
+
 
 def serve_calibration(channel: Channel, setup: CalibrationSetup, niceness: int) -> None:
     """Keep depth images and estimate until the channel ends."""
@@ -93,13 +98,20 @@ class CalibrationServer:
     def __init__(self, setup: CalibrationSetup) -> None:
         self._setup = setup
         self._depths: dict[int, KeyframeDepth] = {}
+        self._edges: dict[int, FrameEdges] = {}
         self._state = SelfCalibration(setup.camera, setup.camera)
 
     def add(self, images: KeyframeImages) -> None:
-        """Keep what is needed of a keyframe's depth images."""
-        self._depths[images.id] = KeyframeDepth.of(images, self._setup.camera)
+        """Keep what is needed of a keyframe's images."""
+        self._depths[images.id] = KeyframeDepth.of(images)
+        if self._setup.looks_at_edges and not self._state.adopted:
+            depth_m, camera = images.depth.depth_m.astype(float), self._setup.camera
+            lag_s = images.lag_s + camera.depth_time_offset_s
+            self._edges[images.id] = FrameEdges.of(images.rgb, depth_m, lag_s, camera)
         if len(self._depths) > MAX_IMAGES:
-            del self._depths[min(self._depths)]
+            oldest = min(self._depths)
+            del self._depths[oldest]
+            self._edges.pop(oldest, None)
 
     def estimate(self, message: EstimateCamera) -> CameraEstimated:
         """What the keyframes say of the camera."""
@@ -116,30 +128,24 @@ class CalibrationServer:
         if estimate is not None:
             logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
             state = judged(self._state, estimate, setup.mode, config, setup.free)
-        late = None if TIME in adopted_parameters(state) else self._by_edges(run, world, kept)
-        self._state = late or state
-        if late is not None:
-            motions = self._motions(world, paths, run, late.camera)
-            return CameraEstimated(late.camera, motions, late.text, False)
+        late = None if TIME in adopted_parameters(state) else self._by_edges(run, world)
+        self._state = state = late or state
         if state.adopted and state.camera != run.camera:
             motions = self._motions(world, paths, run, state.camera)
-            return CameraEstimated(state.camera, motions, state.text, True)
+            return CameraEstimated(state.camera, motions, state.text, late is None)
         done = state.adopted or state.settled or state.looks >= config.stretches
         return CameraEstimated(None, {}, state.text, done)
 
-    def _by_edges(
-        self, run: SavedRun, world: WorldMap, kept: dict[int, KeyframeDepth]
-    ) -> SelfCalibration | None:
+    def _by_edges(self, run: SavedRun, world: WorldMap) -> SelfCalibration | None:
         """The state with a delay of depth that its edges show, if that is large."""
         path = run.trajectories["trajectory.txt"]
-        looks = self._setup.mode == "auto" and self._setup.pairs and not self._state.adopted
-        if not looks or not len(path):
+        kept = [k for k in self._edges if k in world.keyframes]
+        if self._state.adopted or not kept or not len(path):
             return None
-        stamps_s = np.array([world.keyframes[k].timestamp_s for k in kept])
-        twists = twists_at(path, stamps_s)
+        twists = twists_at(path, np.array([world.keyframes[k].timestamp_s for k in kept]))
         moving = np.flatnonzero(twists.any(axis=1))
-        edges = [depth.edges for depth in kept.values()]
-        scores = scores_of([edges[i] for i in moving.tolist()], twists[moving], run.camera)
+        edges = [self._edges[kept[i]] for i in moving.tolist()]
+        scores = scores_of(edges, twists[moving], run.camera)
         return with_sure_delay(self._state, scores, run.camera.depth_time_offset_s)
 
     def _motions(

@@ -52,6 +52,7 @@ class RemoteCalibration:
         self.text = ""
         self._due = setup.config.frames
         self.adopts = setup.mode == "auto"
+        self._sends_colour = setup.looks_at_edges
         self._worker = Worker("calibration", TARGET, setup, NICENESS)
         self._frames = 0
         self._awaited_save: int | None = None
@@ -79,7 +80,8 @@ class RemoteCalibration:
         self._pending = None
         if keyframe is not None and before:
             pixels = keyframe.features.image_pixels
-            self._pending = _Pending(keyframe.id, frame.rgb.copy(), pixels, frame.depth_lag_s)
+            rgb = (frame.rgb if self._sends_colour else frame.rgb[:0]).copy()
+            self._pending = _Pending(keyframe.id, rgb, pixels, frame.depth_lag_s)
 
     def update(self, mapper: RemoteMapper) -> CameraEstimated | None:
         """Ask for an estimate when it is due; returns one that has come."""

@@ -18,8 +18,7 @@ from bmask_slam.sequences.images import depth_in_metres
 
 SPEED = 0.4  # m/s, a wall that goes away
 STEP_S, LAG_S, OFFSET_S = 1 / 30, 0.004, -0.015
-CAMERA = Camera(320, 240, 260.0, 260.0, 160.0, 120.0, depth_scale=1.0)
-COLOUR = np.zeros((240, 320, 3), np.uint8)
+COLOUR = np.zeros((0, 320, 3), np.uint8)
 PIXELS = np.array([[100.0, 80.0], [160.3, 120.7], [220.0, 150.0]])
 
 
@@ -37,7 +36,7 @@ def images(colour_s: float = 10.0) -> KeyframeImages:
 
 
 def test_the_depth_at_the_colour_images_time_is_found_by_the_rate() -> None:
-    depth, sigmas = KeyframeDepth.of(images(), CAMERA), np.full(3, 0.002)
+    depth, sigmas = KeyframeDepth.of(images()), np.full(3, 0.002)
     samples = depth.sample(PIXELS, sigmas)
     inverse = 0.5 + 2e-4 * PIXELS[:, 0]
     np.testing.assert_allclose(samples.rate, -SPEED * inverse**2, rtol=0.03)
@@ -52,7 +51,7 @@ def test_an_unknown_rate_corrects_nothing(fault: str) -> None:
     later = replace(given.after, depth_m=given.after.depth_m + 1)  # another surface
     if fault == "time":
         later = replace(given.after, stamp_s=given.after.stamp_s + 1)
-    depth, sigmas = KeyframeDepth.of(replace(given, after=later), CAMERA), np.full(3, 0.002)
+    depth, sigmas = KeyframeDepth.of(replace(given, after=later)), np.full(3, 0.002)
     samples = depth.sample(PIXELS, sigmas)
     assert np.isnan(samples.rate).all() and np.isfinite(samples.inverse_depth).all()
     assert not depth.delay_correction(np.arange(3), sigmas, OFFSET_S).any()
@@ -61,16 +60,17 @@ def test_an_unknown_rate_corrects_nothing(fault: str) -> None:
 def test_kept_depths_are_the_raw_ones() -> None:
     """What the camera's offset and distortion did to depth and its rate is undone."""
     bend = (0.004, -0.006, 0.010, 0.014, -0.005)
-    bent = replace(CAMERA, depth_offset_m=0.03, depth_distortion=bend)
+    camera = Camera(320, 240, 260.0, 260.0, 160.0, 120.0, depth_scale=1.0)
+    bent = replace(camera, depth_offset_m=0.03, depth_distortion=bend)
     raw = images()
     corrected = (
         DepthImage(depth_in_metres(image.depth_m, bent), image.stamp_s)
         for image in (raw.depth, raw.before, raw.after)
     )
-    kept = KeyframeDepth.of(KeyframeImages(3, COLOUR, PIXELS, *corrected, LAG_S), bent)
+    kept = KeyframeDepth.of(KeyframeImages(3, COLOUR, PIXELS, *corrected, LAG_S))
     sigmas = np.full(3, 0.002)
     found = KeptDepths({3: kept}, bent).measure(3, PIXELS, sigmas)
-    truth = KeyframeDepth.of(raw, CAMERA).sample(PIXELS, sigmas)
+    truth = KeyframeDepth.of(raw).sample(PIXELS, sigmas)
     assert np.abs(kept.sample(PIXELS, sigmas).inverse_depth - truth.inverse_depth).min() > 5e-3
     np.testing.assert_allclose(found.inverse_depth, truth.inverse_depth, atol=2e-4)
     np.testing.assert_allclose(found.rate, truth.rate, rtol=5e-3)
