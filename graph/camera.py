@@ -1,22 +1,23 @@
-"""The pinhole RGB-D camera: lens distortion, the pseudo-stereo model and the noise of its depth."""
+"""The pinhole RGB-D camera: the pseudo-stereo model, the noise of its depth, its mounting."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.errors import MAX_NUMBER
+from bmask_slam.graph.lens import columns, distort_normalised, undistort_normalised
 
-UNDISTORTION_STEPS = 5
 NO_DEPTH_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 MAX_SIDE_PX = 65_535
 LEAST = 1e-9  # smaller focal lengths, scales and rates overflow where they are divided by
 KINECT_DISPARITY_SIGMA_PX = 0.08
+NOISE_DISTANCES_M = np.linspace(0.3, 8.0, 78)
+MAX_NOISE_SHARE, MAX_GRAPH_FACTOR = 0.2, 10.0
 SIDES = ("top", "right", "bottom", "left")
 """Of an image; the number of right angles that it is turned anticlockwise to have that side up."""
 _QUARTER = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -51,6 +52,20 @@ class DepthNoise:
         a_m, b, c_per_m = (factor * value for value in (self.a_m, self.b, self.c_per_m))
         return replace(self, a_m=a_m, b=b, c_per_m=c_per_m)
 
+    def fault(self) -> str:
+        """What no depth sensor has, in words after the coefficients; "" for a possible noise."""
+        sigmas_m = self.depth_sigma_m(NOISE_DISTANCES_M)
+        for wrong, said in (
+            (sigmas_m <= 0, "it must be positive"),
+            (sigmas_m > MAX_NOISE_SHARE * NOISE_DISTANCES_M, "more than a fifth of the depth"),
+        ):
+            if wrong.any():
+                at = int(np.argmax(wrong))
+                return f", {sigmas_m[at]:.3g} m at {NOISE_DISTANCES_M[at]:.1f} m; {said}"
+        limit, factor = MAX_GRAPH_FACTOR, self.in_graph
+        out = f"; its factor in the graph, {factor:g}, must be from 1 to {limit:g}"
+        return "" if 1 <= factor <= limit else out
+
     def depth_sigma_m(self, depth_m: NDArray[Any]) -> NDArray[Any]:
         """Standard deviation in metres of depths (...) in metres."""
         return self.a_m + self.b * depth_m + self.c_per_m * depth_m**2
@@ -81,6 +96,8 @@ class Camera:
     disparity that varies smoothly over the image (Herrera et al., PAMI 34, 2012).
     ``up`` is the side of the image that is up in the world, one of SIDES, where the camera is
     mounted sideways or upside down; "": not said.
+    ``covered`` are parts of the image that do not show the room: the robot itself, an overlay, dirt
+    on the lens. Rectangles (left, top, right, bottom) in pixels, the last column and row excluded.
     """
 
     width: int
@@ -99,10 +116,11 @@ class Camera:
     depth_noise: DepthNoise | None = None
     depth_distortion: tuple[float, float, float, float, float] = NO_DEPTH_DISTORTION
     up: str = ""
+    covered: tuple[tuple[int, int, int, int], ...] = ()
 
     def fault(self) -> str:
         """What no camera can be, in words; "" for a possible camera."""
-        others = ("depth_noise", "up")
+        others = ("depth_noise", "up", "covered")
         numbers = [getattr(self, f.name) for f in fields(self) if f.name not in others]
         flat: Array = np.concatenate([np.ravel(number) for number in numbers]).astype(float)
         if not (np.abs(flat) <= MAX_NUMBER).all():
@@ -112,7 +130,25 @@ class Camera:
         if min(self.fx, self.fy, self.depth_scale, self.fps, self.stereo_bf_px_m) < LEAST:
             what = "a focal length, depth scale, rate or stereo_bf"
             return f"{what} that is not positive, or below {LEAST:g}"
-        return "" if self.up in ("", *SIDES) else f"up {self.up!r}, which is no side of an image"
+        if self.up not in ("", *SIDES):
+            return f"up {self.up!r}, which is no side of an image"
+        bad = self.not_in_image()
+        return f"covered {bad}, which is no part of the image" if bad else ""
+
+    def not_in_image(self) -> str:
+        """The first part of ``covered`` that is empty or outside the image; "" if there is none."""
+        for left, top, right, bottom in self.covered:
+            if not (0 <= left < right <= self.width and 0 <= top < bottom <= self.height):
+                return str([left, top, right, bottom])
+        return ""
+
+    def visible(self, margin_px: int = 0) -> Mask:
+        """(H, W) the pixels that are not covered, nor nearer than ``margin_px`` to such."""
+        mask = np.ones((self.height, self.width), bool)
+        for left, top, right, bottom in self.covered:
+            rows = slice(max(top - margin_px, 0), bottom + margin_px)
+            mask[rows, max(left - margin_px, 0) : right + margin_px] = False
+        return mask
 
     def noise_of_depth(self, disparity_sigma_px: float | None = None) -> DepthNoise:
         """The noise by a constant error of the disparity, if given; else the sensor's own.
@@ -138,7 +174,7 @@ class Camera:
             )  # fmt: skip
             T_self_turned = T_self_turned @ _QUARTER
         bend = NO_DEPTH_DISTORTION
-        plain = replace(camera, rolling_shutter_s=0.0, depth_distortion=bend, up="")
+        plain = replace(camera, rolling_shutter_s=0.0, depth_distortion=bend, up="", covered=())
         return plain, T_self_turned
 
     @property
@@ -220,14 +256,6 @@ class Camera:
         return columns(x, (pixels[..., 1] - self.cy) / self.fy * depth_m, depth_m)
 
 
-def columns(first: Array, *others: Array) -> Array:
-    """Arrays (...) side by side (..., K), of the first one's shape and type."""
-    joined = np.empty((*first.shape, 1 + len(others)), first.dtype)
-    for number, column in enumerate((first, *others)):
-        joined[..., number] = column
-    return joined
-
-
 def depth_distortion_terms(places: Array) -> Array:
     """The terms (..., 5) x, y, x^2, xy, y^2 of ``Camera.depth_distortion``.
 
@@ -236,52 +264,6 @@ def depth_distortion_terms(places: Array) -> Array:
     """
     x, y = np.moveaxis(places, -1, 0)
     return np.stack([x, y, x * x, x * y, y * y], axis=-1)
-
-
-def distort_normalised(normalised: Array, distortion: Sequence[float] | Array) -> Array:
-    """OpenCV's distortion of normalised coordinates (..., 2) by (k1, k2, p1, p2, k3).
-
-    The order of operations is OpenCV's, so that the results are the same to the last bit.
-    """
-    k1, k2, p1, p2, k3 = distortion
-    x, y = normalised[..., 0], normalised[..., 1]
-    r2 = x * x + y * y
-    r4 = r2 * r2
-    radial = 1 + k1 * r2 + k2 * r4 + k3 * (r4 * r2)
-    xy, xx, yy = 2 * x * y, r2 + 2 * x * x, r2 + 2 * y * y
-    return columns(x * radial + p1 * xy + p2 * xx, y * radial + p1 * yy + p2 * xy)
-
-
-def undistort_normalised(normalised: Array, distortion: Sequence[float] | Array) -> Array:
-    """The inverse of ``distort_normalised`` by five fixed-point steps, as in OpenCV.
-
-    A point where the model folds back (negative radial factor) stays as it is.
-    """
-    k1, k2, p1, p2, k3 = distortion
-    x0, y0 = normalised[..., 0], normalised[..., 1]
-    x, y = x0, y0
-    folded = np.zeros(x0.shape, bool)
-    for _ in range(UNDISTORTION_STEPS):
-        r2 = x * x + y * y
-        inverse_radial = 1 / (1 + ((k3 * r2 + k2) * r2 + k1) * r2)
-        folded |= inverse_radial < 0
-        dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        x = np.where(folded, x0, (x0 - dx) * inverse_radial)
-        y = np.where(folded, y0, (y0 - dy) * inverse_radial)
-    return columns(x, y)
-
-
-def distortion_terms(normalised: Array) -> Array:
-    """Derivatives (..., 2, 5) of ``distort_normalised`` by its coefficients, in which it is linear.
-
-    ``distort_normalised(xy, k) = xy + distortion_terms(xy) @ k`` but for rounding.
-    """
-    x, y = np.moveaxis(normalised, -1, 0)
-    r2 = x**2 + y**2
-    along_x = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x**2, x * r2**3], axis=-1)
-    along_y = np.stack([y * r2, y * r2**2, r2 + 2 * y**2, 2 * x * y, y * r2**3], axis=-1)
-    return np.stack([along_x, along_y], axis=-2)
 
 
 def side_towards(direction_camera: Array) -> str:

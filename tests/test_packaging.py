@@ -169,7 +169,7 @@ def test_it_works_with_user_modules_of_the_same_names(installed: Environment) ->
 
 
 def test_every_shipped_configuration_is_in_the_wheel(installed: Environment) -> None:
-    code = "from bmask_slam.graph.data_files import data_path; print(data_path('configs'))"
+    code = "from bmask_slam.graph.files.data_files import data_path; print(data_path('configs'))"
     folder = installed.run("python", "-c", code).strip()
     assert folder == str(installed.site_packages / "bmask_slam/data/configs")
     for path in (ROOT / "data/configs").glob("*.yaml"):

@@ -42,7 +42,7 @@ from benchmarks.pages import WRITTEN
 from benchmarks.paths import ROOT, SHARED
 from benchmarks.semantics.photographs import IMAGES, held_out
 from bmask_slam.graph.arrays import Array, Image, Ints
-from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.semantics.beliefs.class_sizes import SUPPORT, read_sizes
 from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
 from bmask_slam.semantics.beliefs.observation import DISTANCE_STEP

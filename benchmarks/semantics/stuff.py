@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from benchmarks.semantics.nyuv2 import CLASSES, GROUP_OF, GROUPS, labelled, numbers
 from benchmarks.semantics.train_stuff import held_out
 from bmask_slam.graph.arrays import Array, Bytes, Ints
-from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.semantics.training.stuff_images import IGNORED
 from bmask_slam.semantics.weights import light_weights, stuff_weights
 

@@ -17,7 +17,7 @@ import cv2
 import torch
 
 from benchmarks.semantics.nyuv2 import CLASSES, labelled, numbers
-from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.runtime.progress import console_log, counting_bar
 from bmask_slam.semantics.labels import read_label_set
 from bmask_slam.semantics.training.stuff import StuffTrainingConfig, train_stuff

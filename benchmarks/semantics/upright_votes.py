@@ -18,7 +18,7 @@ from benchmarks.pages import table
 from benchmarks.paths import SHARED
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import SIDES
-from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.segmenters.light_segmenter import LightSegmenter
 from bmask_slam.semantics.segmenters.upright import UpVotes, sample, turned

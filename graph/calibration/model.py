@@ -31,13 +31,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints, Mask
-from bmask_slam.graph.camera import (
-    Camera,
-    depth_distortion_terms,
-    distort_normalised,
-    distortion_terms,
-)
+from bmask_slam.graph.camera import Camera, depth_distortion_terms
 from bmask_slam.graph.geometry import inverse, skew
+from bmask_slam.graph.lens import distort_normalised, distortion_terms
 
 PARAMETERS = (
     *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),

@@ -1,12 +1,10 @@
 """Whether a run should use what was found of its camera: by one estimate and the next.
 
 Of a camera's parameters the readout time, the delay of depth and the distortion of depth may be
-adopted; the last, five coefficients, as a whole.
-
-What was found is adopted if it is observable, differs from what the camera given for the run has,
-is found by either half of the keyframes, and fits the half that it was not estimated from better by
-two standard errors (`graph.calibration.cross_validation`). Where halves in the order of time do not
-prove it, every second keyframe is in the other half. The last look of a run decides anew.
+adopted; the last, five coefficients, as a whole. What was found is adopted if it is observable,
+differs from what the camera given for the run has, is found by either half of the keyframes, and
+fits the half that it was not estimated from better by two standard errors; where halves in the
+order of time do not prove it, the half of every second keyframe. The last look decides anew.
 """
 
 from __future__ import annotations
@@ -95,6 +93,7 @@ class SelfCalibration:
         looks: how often the run was looked at in vain.
         settled: whether it needs no other look.
         bend_sigma: standard deviation of the distortion of depth that was adopted, in 1/m.
+        covered: the same of ``Camera.covered``.
     """
 
     given: Camera
@@ -103,6 +102,7 @@ class SelfCalibration:
     looks: int = 0
     settled: bool = False
     bend_sigma: float = 0.0
+    covered: str = ""
 
     @property
     def adopted(self) -> bool:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from bmask_slam.calibration.views import (
     MAX_RATE_STEP_S,
-    MAX_STEP_SIGMAS,
     Depths,
     measured_at,
 )
@@ -79,7 +78,7 @@ class KeyframeDepth:
     def sample(self, pixels: Array, sigmas: Array) -> Depths:
         """At pixels (m, 2) as exposed, whose inverse depths have these sigmas (m,) in 1/m."""
         images = self.inverse_depth.astype(float), self.rate.astype(float)
-        return measured_at(pixels, *images, self.lag_s, MAX_STEP_SIGMAS * sigmas)
+        return measured_at(pixels, *images, self.lag_s, sigmas)
 
     def delay_correction(self, keypoints: Ints, sigmas: Array, offset_s: float) -> Array:
         """What to add to inverse depths (N,) so that they are those at the colour image's time.

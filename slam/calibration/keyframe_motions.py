@@ -13,7 +13,8 @@ import numpy as np
 from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.calibration.motion import twists_at
 from bmask_slam.calibration.views import frames_of
-from bmask_slam.features.brisk import FeatureConfig, sample_depth
+from bmask_slam.features.brisk import FeatureConfig
+from bmask_slam.features.keypoint_depth import sample_depth
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory

@@ -7,10 +7,10 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
 
-import cv2
 import numpy as np
 
 from bmask_slam.calibration.motion import LandmarkMotion, as_exposed
+from bmask_slam.features.keypoint_depth import mean_on_plane, smooth_value
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.calibration.model import CalibrationViews
 from bmask_slam.graph.camera import NO_DEPTH_DISTORTION, Camera
@@ -22,12 +22,6 @@ from bmask_slam.sequences.sequence import Sequence
 
 MIN_VIEWS = 2
 MIN_KEYFRAME_VIEWS = 12
-VALUE_RADIUS_PX, RATE_RADIUS_PX = 6, 14
-RATE_STEP_PX = 2
-"""Every second pixel of the wide windows is used: depth errors of neighbours are correlated."""
-MIN_WINDOW_SHARE = 0.6
-MAX_STEP_SIGMAS = 4.0
-"""A window shows one smooth surface if all pixels are within so many sensor sigmas of its plane."""
 MAX_RATE_STEP_S = 0.2
 MAX_LATE_S = 1e-5
 
@@ -218,12 +212,12 @@ class SequenceDepths:
         image = _raw_inverse_depth(sequence, index)
         change, step_s = _change_around(sequence, index)
         lag_s = sequence.pairs.lags_s[index] - sequence.camera.depth_time_offset_s
-        return measured_at(pixels, image, change / step_s, lag_s, MAX_STEP_SIGMAS * sigmas)
+        return measured_at(pixels, image, change / step_s, lag_s, sigmas)
 
 
-def measured_at(pixels: Array, image: Array, rate: Array, lag_s: float, max_step: Array) -> Depths:
+def measured_at(pixels: Array, image: Array, rate: Array, lag_s: float, sigmas: Array) -> Depths:
     """Measurements at pixels (m, 2) of an image (H, W) of inverse depth, and of its rate."""
-    planes, rms = smooth_value(image, pixels, max_step)
+    planes, rms, max_step = smooth_value(image, pixels, sigmas)
     rates = mean_on_plane(rate, image, pixels, planes, max_step)
     return Depths(planes[:, 0], rms, rates, np.full(len(rms), lag_s))
 
@@ -251,48 +245,3 @@ def _change_around(sequence: Sequence, index: int) -> tuple[Array, float]:
     if after - before < 2 or not 0 < step_s < MAX_RATE_STEP_S:
         change[:] = np.nan
     return change, step_s
-
-
-def smooth_value(image: Array, pixels: Array, max_step: Array) -> tuple[Array, Array]:
-    """A plane fitted to an image around pixels (M, 2): value and slopes (M, 3), and rms (M,).
-
-    NaN where few pixels are valid or one in the window is off the plane by ``max_step`` (M,).
-    """
-    values, offsets = _windows(image, pixels, VALUE_RADIUS_PX)
-    plane, error = _fit_planes(values, offsets)
-    smooth = np.nanmax(np.abs(error), axis=1, initial=0.0) < max_step
-    rms = np.sqrt(np.nansum(error**2, axis=1) / error.shape[1])
-    return np.where(smooth[:, None], plane, np.nan), np.where(smooth, rms, np.nan)
-
-
-def mean_on_plane(
-    change: Array, image: Array, pixels: Array, planes: Array, max_step: Array
-) -> Array:
-    """The change (M,) at pixels, fitted over wide windows where the image is on these planes."""
-    values, offsets = _windows(change, pixels, RATE_RADIUS_PX, RATE_STEP_PX)
-    around = _windows(image, pixels, RATE_RADIUS_PX, RATE_STEP_PX)[0]
-    expected = planes[:, :1] + (offsets @ planes[:, 1:, None])[..., 0]
-    values[~(np.abs(around - expected) < max_step[:, None])] = np.nan
-    return _fit_planes(values, offsets)[0][:, 0]
-
-
-def _windows(image: Array, pixels: Array, radius: int, step: int = 1) -> tuple[Array, Array]:
-    """Values (M, n) in square windows around pixels (M, 2), and their offsets (M, n, 2)."""
-    border = cv2.BORDER_CONSTANT
-    padded = cv2.copyMakeBorder(image, radius, radius, radius, radius, border, value=float("nan"))
-    dv, du = (d.ravel() for d in np.mgrid[: 2 * radius + 1 : step, : 2 * radius + 1 : step])
-    nearest = np.clip(np.rint(pixels).astype(int), 0, np.array(image.shape[::-1]) - 1)
-    values = padded[nearest[:, 1:] + dv, nearest[:, :1] + du]
-    offsets = np.stack([du - radius, dv - radius], axis=1) + (nearest - pixels)[:, None]
-    return values, offsets
-
-
-def _fit_planes(values: Array, offsets: Array) -> tuple[Array, Array]:
-    """Planes fitted to windows: value and slopes (M, 3), NaN with few values; errors (M, n)."""
-    valid = np.isfinite(values)
-    A = np.concatenate([np.ones((*values.shape, 1)), offsets], axis=2) * valid[..., None]
-    H = A.swapaxes(1, 2) @ A + 1e-9 * np.eye(3)
-    plane = np.linalg.solve(H, A.swapaxes(1, 2) @ np.nan_to_num(values)[..., None])
-    error = values - (A @ plane)[..., 0]
-    enough = valid.mean(axis=1) >= MIN_WINDOW_SHARE
-    return np.where(enough[:, None], plane[..., 0], np.nan), error

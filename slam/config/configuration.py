@@ -19,8 +19,8 @@ from typing import Any, TypeVar, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from bmask_slam.graph.data_files import given_or_shipped
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.data_files import given_or_shipped
 from bmask_slam.graph.files.yaml_file import format_yaml, parse_yaml, read_yaml
 
 Config = TypeVar("Config")

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, PositiveInt, StringConstraints
 
-from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.graph.files.file_names import check_name
 from bmask_slam.graph.files.json_file import check_json
 from bmask_slam.graph.files.yaml_file import read_yaml

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from bmask_slam.features.fixed_size_descriptor import FixedSizeBrisk
+from bmask_slam.features.keypoint_depth import sample_depth
 from bmask_slam.graph.arrays import Array, Bits, Bytes, Floats, Image, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -16,6 +17,8 @@ from bmask_slam.sequences.frame import Frame
 
 MAX_LAYERS = 4
 FINEST_SIZE_PX = 12.0  # OpenCV's size of a BRISK keypoint in the finest layer
+COVERED_MARGIN_PX = 8
+"""Corners nearer to a covered part of the image are its border's, or show some of it."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,9 @@ class BriskExtractor:
         self._depth_noise = camera.noise_of_depth(config.disparity_sigma_px)
         self._describer = FixedSizeBrisk(FINEST_SIZE_PX)
         self._border_px = max(config.border_px, self._describer.reach_px)
+        self._visible = (
+            camera.visible(COVERED_MARGIN_PX).astype(np.uint8) if camera.covered else None
+        )
         thresholds = (*config.thresholds, *config.faint_thresholds)
         self._fast = {t: cv2.FastFeatureDetector_create(t) for t in thresholds}
 
@@ -148,9 +154,12 @@ class BriskExtractor:
         )
 
     def at(self, frame: Frame, gray: Image, pixels: Array) -> tuple[Ints, Features]:
-        """Keypoints where none were detected: those of the pixels (N, 2) inside, and their rows."""
+        """Keypoints where none were detected: of the pixels (N, 2) in view, and their rows."""
         reach, size = self._describer.reach_px, np.array(gray.shape[::-1])
         rows = np.flatnonzero(((pixels > reach) & (pixels < size - 1 - reach)).all(axis=1))
+        if self._visible is not None:
+            columns, lines = np.rint(pixels[rows]).astype(int).T
+            rows = rows[self._visible[lines, columns] > 0]
         pixels, ones = pixels[rows], np.ones(len(rows))
         bits, angles_rad = self._describer.describe(gray, pixels.astype(np.float32))
         return rows, self._assemble(frame, gray, (pixels, ones, angles_rad), bits)
@@ -187,7 +196,9 @@ class BriskExtractor:
         border, (height, width) = self._border_px, gray.shape
         inside = np.zeros_like(gray)
         inside[border : height - border, border : width - border] = 255
-        return inside
+        if self._visible is None:
+            return inside
+        return inside * cv2.resize(self._visible, (width, height), interpolation=cv2.INTER_NEAREST)
 
     def _spread(self, pixels: Floats, response: Array, width: int) -> Ints:
         """The order of keypoints (N, 2): every bucket's strongest, then the second, and so on."""
@@ -250,33 +261,3 @@ def spread_order(bucket: Ints, score: Array) -> Ints:
     run_lengths = np.diff(np.r_[starts, len(order)])
     rank = np.arange(len(order)) - np.repeat(starts, run_lengths)
     return order[np.lexsort((-score[order], rank))]
-
-
-def sample_depth(depth_m: Floats, pixels: Array, config: FeatureConfig) -> tuple[Array, Array]:
-    """Depth (N,) at keypoints and its local spread (N,) in metres.
-
-    The depth is the median of the valid pixels in a small window; the spread is half
-    their interquartile range, so that slanted and rough surfaces are trusted less. Where the window
-    straddles a depth edge (a range above ``depth_edge_ratio`` z) colour and depth disagree about
-    which side the keypoint is on, and the depth is NaN.
-    """
-    radius = config.depth_window_px
-    height, width = depth_m.shape
-    offsets = np.arange(-radius, radius + 1)
-    rows = np.clip(np.rint(pixels[:, 1]).astype(int)[:, None] + offsets, 0, height - 1)
-    columns = np.clip(np.rint(pixels[:, 0]).astype(int)[:, None] + offsets, 0, width - 1)
-    window = depth_m[rows[:, :, None], columns[:, None, :]].reshape(len(pixels), offsets.size**2)
-    window = np.sort(window.astype(float), axis=1)  # NaN sorts last
-    count = np.isfinite(window).sum(axis=1)
-    index = np.arange(len(pixels))
-    last = np.maximum(count - 1, 0)
-    median = window[index, last // 2]
-    spread = (window[index, (3 * last) // 4] - window[index, last // 4]) / 2
-    extent = window[index, last] - window[:, 0]
-    good = (
-        (count * 2 > offsets.size**2)
-        & (median > config.min_depth_m)
-        & (median < config.max_depth_m)
-        & (extent < config.depth_edge_ratio * median)
-    )
-    return np.where(good, median, np.nan), np.where(good, spread, np.nan)

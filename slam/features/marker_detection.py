@@ -7,7 +7,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bmask_slam.features.brisk import FeatureConfig, sample_depth
+from bmask_slam.features.brisk import FeatureConfig
+from bmask_slam.features.keypoint_depth import sample_depth
 from bmask_slam.features.marker_corners import refined_corners
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera

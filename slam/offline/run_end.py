@@ -66,7 +66,8 @@ def finish_run(run: ActiveRun) -> RunSummary:
         run.folder.complete()
     folder = run.folder.path
     resumable = stopped_by is not None and (folder / CHECKPOINT).is_file()
-    text = run.calibrator.state.text
+    found = run.calibrator.state
+    text = "; ".join(filter(None, (found.text, found.covered)))
     return RunSummary(
         folder,
         rows,

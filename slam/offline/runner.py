@@ -25,6 +25,7 @@ from bmask_slam.graph.sensors.streams import read_folder
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps
 from bmask_slam.labelling.mask_memory import MaskMemory, RememberingSegmenter
 from bmask_slam.labelling.upright_images import upright_of
+from bmask_slam.moving.covered_parts import covered_camera
 from bmask_slam.offline.checkpoint import Checkpoint, read_checkpoint
 from bmask_slam.offline.frame_loop import ActiveRun, process_frames, run_indices
 from bmask_slam.offline.map_localisation import MapLocalisation
@@ -72,8 +73,10 @@ def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummar
         ExitStack() as stack,
     ):
         describe_run(folder, options, sequence)
+        sequence, covered = _without_covered_parts(options, sequence)
         make, masks = stack.enter_context(_system_maker(make_system, options, sequence))
-        calibrator = _calibrator(options, inherited_calibration(options, sequence), masks)
+        begin = replace(inherited_calibration(options, sequence), covered=covered)
+        calibrator = _calibrator(options, begin, masks)
         if calibrator.state.adopted:
             sequence = open_sequence(options.sequence, camera=calibrator.state.camera)
         active = ActiveRun(
@@ -137,6 +140,16 @@ def _finished(active: ActiveRun, make_system: MakeSystem) -> RunSummary:
     return finish_run(active)
 
 
+def _without_covered_parts(options: RunOptions, sequence: Sequence) -> tuple[Sequence, str]:
+    """The sequence without what does not show the room, if nothing is said of it; what it is."""
+    if options.calibrate == "off" or sequence.camera.covered:
+        return sequence, ""
+    camera, text = covered_camera(sequence, run_indices(sequence, options))
+    if not text or options.calibrate == "report":
+        return sequence, text and f"{text}: found, not left out"
+    return sequence.with_camera(camera), f"{text}: left out"
+
+
 def _calibrator(
     options: RunOptions, state: SelfCalibration, masks: MaskMemory | None
 ) -> SelfCalibrator:
@@ -148,10 +161,10 @@ def _calibrator(
 def _reopened(options: RunOptions, checkpoint: Checkpoint) -> Sequence:
     """The sequence of a run, with the camera that the run has found; else with its own."""
     sequence = open_sequence(options.sequence, camera=options.camera)
-    calibration = checkpoint.calibration
-    if calibration.adopted and sequence.camera == calibration.given:
-        return open_sequence(options.sequence, camera=calibration.camera)
-    return sequence
+    own, found = sequence.camera, checkpoint.calibration
+    if found.covered:
+        own = replace(own, covered=found.given.covered)
+    return sequence if own != found.given else sequence.with_camera(found.camera)
 
 
 def inherited_calibration(options: RunOptions, sequence: Sequence) -> SelfCalibration:
@@ -167,6 +180,7 @@ def _calibration_of_map(options: RunOptions, source: Path, given: Camera) -> Sel
     camera = read_map(source)[1]
     found = ("rolling_shutter_s", "depth_time_offset_s", "depth_distortion")
     times = {name: getattr(camera, name) for name in found}
+    camera = replace(camera, covered=given.covered)
     if options.camera is not None or replace(given, **times) != camera or camera == given:
         return SelfCalibration(given, given)
     return SelfCalibration(given, camera, f"camera as found by {source}")
@@ -247,9 +261,9 @@ def with_sensors(system: System, sequence: Sequence) -> System:
 
 
 def _differing(made: Camera, now: Camera) -> str:
-    """In what two cameras differ, but for noise of depth and mounting: "fx 525.0 and 517.3"."""
+    """In what two cameras differ that decides where points are: "fx 525.0 and 517.3"."""
     pairs = ((f.name, getattr(made, f.name), getattr(now, f.name)) for f in fields(Camera))
-    others = "depth_noise", "up"
+    others = "depth_noise", "up", "covered"
     return ", ".join(f"{n} {a} and {b}" for n, a, b in pairs if n not in others and a != b)
 
 

@@ -9,9 +9,13 @@ from collections.abc import Container
 from dataclasses import astuple
 from pathlib import Path
 
-import numpy as np
-
-from bmask_slam.graph.camera import MAX_SIDE_PX, NO_DEPTH_DISTORTION, SIDES, Camera, DepthNoise
+from bmask_slam.graph.camera import (
+    MAX_SIDE_PX,
+    NO_DEPTH_DISTORTION,
+    SIDES,
+    Camera,
+    DepthNoise,
+)
 from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.files.yaml_file import format_yaml, read_yaml
 from bmask_slam.graph.whole_file import whole_file, writing
@@ -39,14 +43,15 @@ OPTIONAL = {
     "rolling_shutter": "rolling_shutter_s",
 }
 """Optional numbers by the name of Camera's attribute."""
-KEYS = (*REQUIRED, "distortion", "depth_noise", "depth_distortion", "up", *OPTIONAL)
+OTHERS = ("distortion", "depth_noise", "depth_distortion", "up", "covered")
+KEYS = (*REQUIRED, *OTHERS, *OPTIONAL)
 MAX_DEPTH_DISTORTION = 0.2
 """In 1/m: an error of 20 cm at 1 m."""
 LIMITS = {"depth_offset": 1.0, "depth_time_offset": 1.0, "rolling_shutter": 1.0}
 """Largest magnitudes in metres and seconds: a larger value is in another unit."""
-NOISE_DISTANCES_M = np.linspace(0.3, 8.0, 78)
-MAX_NOISE_SHARE = 0.2
-MAX_GRAPH_FACTOR = 10.0
+COVERED_CURE = (
+    "write [[left, top, right, bottom], ...] in whole pixels, such as [[0, 400, 640, 480]]"
+)
 NOISE_CURE = (
     "write [a, b, c] of its standard deviation a + b z + c z^2 in metres at z metres, such as "
     "[0.0012, 0, 0.0019]"
@@ -138,8 +143,7 @@ def read_camera(path: Path) -> Camera:
 def _read(path: Path) -> tuple[Camera, set[str]]:
     """The camera of a file, and the keys that the file has."""
     values = _values(path)
-    others = ("distortion", "depth_noise", "depth_distortion", "up")
-    numbers = {k: _number(path, k, v) for k, v in values.items() if k not in others}
+    numbers = {k: _number(path, k, v) for k, v in values.items() if k not in OTHERS}
     _check_range(path, numbers)
     optional = {name: numbers[key] for key, name in OPTIONAL.items() if key in numbers}
     camera = Camera(
@@ -150,8 +154,11 @@ def _read(path: Path) -> tuple[Camera, set[str]]:
         depth_noise=_depth_noise(path, values["depth_noise"]) if "depth_noise" in values else None,
         depth_distortion=_depth_distortion(path, values.get("depth_distortion", [0, 0, 0, 0, 0])),
         up=_up(path, values["up"]) if "up" in values else "",
+        covered=_covered(path, values.get("covered", [])),
         **optional,
     )
+    if bad := camera.not_in_image():
+        raise InputError(f"{path}: covered has {bad}, no part of the image; {COVERED_CURE}")
     return camera, set(values)
 
 
@@ -199,6 +206,8 @@ def format_camera(camera: Camera, comment: str = "") -> str:
         values["depth_distortion"] = list(camera.depth_distortion)
     if camera.up:
         values["up"] = camera.up
+    if camera.covered:
+        values["covered"] = [list(rectangle) for rectangle in camera.covered]
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
     lines.append(format_yaml(values).rstrip())
     return "\n".join(lines) + "\n"
@@ -244,6 +253,15 @@ def _up(path: Path, value: object) -> str:
     return str(value)
 
 
+def _covered(path: Path, value: object) -> tuple[tuple[int, int, int, int], ...]:
+    """Rectangles of the image."""
+    rectangles: list[list[int]] = value if isinstance(value, list) else [value]
+    for one in rectangles:
+        if not (isinstance(one, list) and len(one) == 4 and all(type(e) is int for e in one)):
+            raise InputError(f"{path}: covered has {one!r}; {COVERED_CURE}")
+    return tuple((left, top, right, bottom) for left, top, right, bottom in rectangles)
+
+
 def _distortion(path: Path, value: object) -> tuple[float, float, float, float, float]:
     """OpenCV's (k1, k2, p1, p2, k3); k3 may be left out."""
     if not isinstance(value, list) or len(value) not in (4, 5):
@@ -276,20 +294,6 @@ def _depth_noise(path: Path, value: object) -> DepthNoise:
     if not isinstance(value, list) or len(value) not in (3, 4):
         raise InputError(f"{path}: depth_noise is {value!r}; {NOISE_CURE}")
     noise = DepthNoise(*(_number(path, "depth_noise", v) for v in value))
-    sigmas_m = noise.depth_sigma_m(NOISE_DISTANCES_M)
-    for wrong, said in (
-        (sigmas_m <= 0, "it must be positive"),
-        (sigmas_m > MAX_NOISE_SHARE * NOISE_DISTANCES_M, "more than a fifth of the depth"),
-    ):
-        if wrong.any():
-            at = int(np.argmax(wrong))
-            raise InputError(
-                f"{path}: depth_noise is {value}, {sigmas_m[at]:.3g} m at "
-                f"{NOISE_DISTANCES_M[at]:.1f} m; {said}; {NOISE_CURE}"
-            )
-    if not 1 <= noise.in_graph <= MAX_GRAPH_FACTOR:
-        raise InputError(
-            f"{path}: depth_noise is {value}; its factor in the graph, {noise.in_graph:g}, must be "
-            f"from 1 to {MAX_GRAPH_FACTOR:g}"
-        )
+    if fault := noise.fault():
+        raise InputError(f"{path}: depth_noise is {value}{fault}; {NOISE_CURE}")
     return noise

@@ -39,7 +39,7 @@ class Frame:
 
 
 def check_frame(frame: Frame, camera: Camera, last_stamp_s: float = -math.inf) -> Frame:
-    """The frame as tracking needs it: float32 depth, NaN where it was 0.
+    """The frame as tracking needs it: float32 depth, NaN where it was 0 or the image is covered.
 
     Args:
         last_stamp_s: stamp of the frame before.
@@ -61,7 +61,10 @@ def check_frame(frame: Frame, camera: Camera, last_stamp_s: float = -math.inf) -
             f"{where}: depth is {_described(frame.depth_m)}; give metres as float32 {size}, "
             "registered to the colour image"
         )
-    return replace(frame, depth_m=_checked_depth(frame.depth_m, where))
+    depth_m = _checked_depth(frame.depth_m, where)
+    if camera.covered:
+        depth_m = np.where(camera.visible(), depth_m, np.float32(np.nan))
+    return replace(frame, depth_m=depth_m)
 
 
 def check_finite_stamp(stamp_s: float) -> None:

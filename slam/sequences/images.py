@@ -64,7 +64,7 @@ def depth_in_metres(stored: NDArray, camera: Camera) -> Floats:
     """Depth (H, W) in metres from stored values, integers or floats.
 
     Paper eq. 9 and an offset, 1/z less the camera's ``depth_distortion``; NaN where the values are
-    0, negative or not finite.
+    0, negative or not finite, and in what is covered.
     """
     depth_m = np.divide(stored, np.float32(camera.depth_scale), dtype=np.float32)
     if camera.depth_offset_m:
@@ -73,6 +73,13 @@ def depth_in_metres(stored: NDArray, camera: Camera) -> Floats:
         with np.errstate(invalid="ignore", divide="ignore"):
             depth_m /= 1 - depth_m * _depth_bend(camera)
     depth_m[~((stored > 0) & (depth_m > 0) & (depth_m < np.inf))] = np.nan
+    return without_covered(depth_m, camera)
+
+
+def without_covered(depth_m: Floats, camera: Camera) -> Floats:
+    """A depth image (H, W) with NaN in the parts that do not show the room, changed in place."""
+    for left, top, right, bottom in camera.covered:
+        depth_m[top:bottom, left:right] = np.nan
     return depth_m
 
 

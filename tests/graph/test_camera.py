@@ -11,10 +11,9 @@ from bmask_slam.graph.camera import (
     Camera,
     DepthNoise,
     direction_of,
-    distort_normalised,
-    distortion_terms,
     side_towards,
 )
+from bmask_slam.graph.lens import distort_normalised, distortion_terms
 
 CAMERA = Camera(640, 480, fx=525.0, fy=510.0, cx=318.5, cy=241.5, stereo_bf_px_m=40.0)
 FREIBURG1 = Camera(

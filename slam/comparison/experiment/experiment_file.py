@@ -17,8 +17,8 @@ from bmask_slam.comparison.experiment.experiment import (
     SequenceSource,
 )
 from bmask_slam.config.configuration import find_config, from_tree, resolve
-from bmask_slam.graph.data_files import given_or_shipped
 from bmask_slam.graph.errors import InputError, did_you_mean
+from bmask_slam.graph.files.data_files import given_or_shipped
 from bmask_slam.graph.files.yaml_file import read_yaml
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S
 from bmask_slam.rendering.config import SCENES, RenderConfig

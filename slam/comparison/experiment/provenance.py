@@ -20,7 +20,7 @@ from bmask_slam import __version__, graph, mapping, semantics
 from bmask_slam.comparison.experiment.experiment import OPTIONS, Configuration, Experiment
 from bmask_slam.config.configuration import differences, dump, find_config, resolve
 from bmask_slam.evaluation.reference import TRUTH, TRUTH_BODY
-from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.graph.files.reading import read_bytes, read_text
 from bmask_slam.rendering.config import RenderConfig
 from bmask_slam.runtime.machine import commit, describe_machine, versions

@@ -9,8 +9,8 @@ import pytest
 import torch
 from repository import shared
 
-from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.network.boxes import iou

@@ -11,7 +11,7 @@ import torch
 from repository import shared
 
 from bmask_slam.cli import main
-from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.semantics.labels import label_set, read_label_set
 from bmask_slam.semantics.network.config import LIGHT
 from bmask_slam.semantics.network.model import MaskRCNN

@@ -12,7 +12,7 @@ from calibration_run import camera_path, make_run, room_depth
 from bmask_slam import cli
 from bmask_slam.calibration.calibrate import CalibrateOptions, calibrate_run
 from bmask_slam.calibration.report import format_calibration
-from bmask_slam.calibration.views import smooth_value
+from bmask_slam.features.keypoint_depth import smooth_value
 from bmask_slam.graph.calibration.model import TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -123,13 +123,25 @@ def test_a_plane_is_fitted_between_pixels_and_an_edge_is_rejected() -> None:
     v, u = np.mgrid[:60, :80].astype(float)
     image = 0.5 + 0.002 * u - 0.001 * v
     pixels = np.array([[20.3, 30.7], [41.8, 12.2], [1.0, 1.0]])
-    planes, rms = smooth_value(image, pixels, np.full(3, 0.01))
+    planes, rms, max_step = smooth_value(image, pixels, np.full(3, 0.0025))
     value = planes[:, 0]
     expected = 0.5 + 0.002 * pixels[:2, 0] - 0.001 * pixels[:2, 1]
     np.testing.assert_allclose(value[:2], expected, atol=1e-9)
     assert (rms[:2] < 1e-9).all() and np.isnan(value[2])  # most of its window is outside
     image[:, 40:] *= 0.8
-    assert np.isnan(smooth_value(image, pixels, np.full(3, 0.01))[0][1]).all()
+    assert np.isnan(smooth_value(image, pixels, np.full(3, 0.0025))[0][1]).all()
+    assert (max_step == 0.01).all()
+
+
+def test_what_is_smooth_is_judged_by_the_noise_of_the_image() -> None:
+    u = np.mgrid[:480, :640][1].astype(float)
+    noise = np.random.default_rng(1).normal(size=u.shape)
+    image = 0.5 + 1e-4 * u + np.where(u < 300, 0.0, 0.1) + 0.006 * noise
+    pixels = np.column_stack([x.ravel() for x in np.mgrid[20:620:30, 20:460:40]]).astype(float)
+    planes, _, max_step = smooth_value(image, pixels, np.full(len(pixels), 0.002))
+    assert 3.5 * 0.006 < max_step[0] < 4.5 * 0.006
+    at_edge = np.abs(pixels[:, 0] - 299.5) < 5
+    assert np.isfinite(planes[~at_edge]).mean() > 0.9 and np.isnan(planes[at_edge]).all()
 
 
 # --- bad input ------------------------------------------------------------------------------------

@@ -18,8 +18,8 @@ import bmask_slam.rendering.sequence
 from bmask_slam import cli
 from bmask_slam.commands import sequences
 from bmask_slam.config.configuration import resolve
-from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.graph.trajectory import write_tum
 from bmask_slam.offline.runner import RunSummary
 from bmask_slam.rendering.config import SCENES, RenderConfig

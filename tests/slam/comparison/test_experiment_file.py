@@ -6,8 +6,8 @@ import pytest
 
 from bmask_slam.comparison.experiment.experiment import Configuration
 from bmask_slam.comparison.experiment.experiment_file import find_experiment, read_experiment
-from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.data_files import data_path
 
 WHOLE = """\
 title: All keys

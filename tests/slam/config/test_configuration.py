@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bmask_slam.config.configuration import differences, dump, find_config, from_text, resolve
-from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.system_config import SystemConfig
 
 

@@ -20,8 +20,8 @@ from bmask_slam.datasets import web_file
 from bmask_slam.datasets.catalogue import Recording, find, read_catalogue
 from bmask_slam.datasets.obtain import RECEIVED, SUMS, obtain, read_sums
 from bmask_slam.evaluation.reference import BONN
-from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.sequences.sequence import open_sequence
 

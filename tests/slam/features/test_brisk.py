@@ -13,9 +13,9 @@ from bmask_slam.features.brisk import (
     FeatureConfig,
     Features,
     joined,
-    sample_depth,
     spread_order,
 )
+from bmask_slam.features.keypoint_depth import sample_depth
 from bmask_slam.features.matching import hamming
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.camera import KINECT_DISPARITY_SIGMA_PX, Camera, DepthNoise
@@ -250,6 +250,36 @@ def test_without_depth_features_are_monocular() -> None:
     assert np.isnan(features.depth_m).all()
     assert np.isnan(features.measurements[:, 2]).all()
     assert np.isfinite(features.sigmas_px[:, :2]).all()
+
+
+def test_no_keypoints_in_covered_parts() -> None:
+    camera = dataclasses.replace(CAMERA, covered=((0, 300, 640, 480), (100, 0, 200, 120)))
+    extractor = BriskExtractor(camera, dataclasses.replace(CONFIG, layer_shares=(0.7, 0.3)))
+    features = extractor.extract(FRONTAL)
+    columns, rows = np.rint(features.image_pixels).astype(int).T
+    assert len(features) > 300 and camera.visible(7)[rows, columns].all()
+    more = extractor.reserve(FRONTAL, features, 0.5)
+    columns, rows = np.rint(more.image_pixels).astype(int).T
+    assert len(more) and camera.visible(7)[rows, columns].all()
+    places = np.array([[150.0, 60.0], [320.0, 200.0], [320.0, 400.0]])
+    assert extractor.at(FRONTAL, features.gray, places)[0].tolist() == [1]
+
+
+def noisy_wall(share: float) -> np.ndarray:
+    """A wall at 2 m, and beside it one at 2.6 m, with noise of this share of the depth."""
+    depth = np.full((480, 640), 2.0)
+    depth[:, 400:] = 2.6
+    return depth * (1 + share * np.random.default_rng(3).normal(size=depth.shape))
+
+
+@pytest.mark.parametrize("share", [0.001, 0.015, 0.03])
+def test_noise_of_the_whole_image_is_no_depth_edge(share: float) -> None:
+    v, u = np.mgrid[20:460:10, 20:620:7]
+    pixels = np.column_stack([u.ravel(), v.ravel()]).astype(float)
+    depth_m, _ = sample_depth(noisy_wall(share).astype(np.float32), pixels, CONFIG)
+    at_edge = np.abs(pixels[:, 0] - 399.5) < CONFIG.depth_window_px
+    assert np.isfinite(depth_m[~at_edge]).mean() > 0.9
+    assert np.isnan(depth_m[at_edge]).all()
 
 
 def depth_at(depth: np.ndarray, u: float, v: float) -> tuple[float, float]:

@@ -47,6 +47,19 @@ def test_optional_keys(tmp_path):
     assert read_camera(path).distortion == (0.1, 0.2, 0.3, 0.4, 0)
 
 
+def test_covered_parts_are_read_and_written(tmp_path):
+    path = write_camera(tmp_path, covered="[[0, 400, 640, 480], [10, 0, 20, 5]]")
+    camera = read_camera(path)
+    assert camera.covered == ((0, 400, 640, 480), (10, 0, 20, 5))
+    write_file(tmp_path / "again.yaml", camera)
+    assert read_camera(tmp_path / "again.yaml") == camera
+    visible, wider = camera.visible(), camera.visible(5)
+    assert visible.shape == (480, 640) and (~visible).sum() == 80 * 640 + 5 * 10
+    assert not wider[395:].any() and wider[394].all() and not wider[:10, 5:25].any()
+    assert hash(camera) and camera.fault() == ""
+    assert "[0, 0, 700, 9], which is no part" in replace(camera, covered=((0, 0, 700, 9),)).fault()
+
+
 def test_the_example_in_the_messages_is_valid(tmp_path):
     (tmp_path / "camera.yaml").write_text(CAMERA_EXAMPLE)
     assert read_camera(tmp_path / "camera.yaml") == Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -92,6 +105,14 @@ def test_the_example_in_the_messages_is_valid(tmp_path):
         ({"depth_noise": "0.002"}, r"depth_noise is 0.002; write \[a, b, c\]"),
         ({"depth_noise": "[0.1, x, 0]"}, "depth_noise is 'x'"),
         ({"up": "down"}, "up is 'down'; it is the side of the image .* top, right, bottom, left"),
+        (
+            {"covered": "bottom"},
+            r"covered has 'bottom'; write \[\[left, top, right",
+        ),
+        ({"covered": "[0, 400, 640, 480]"}, r"covered has 0; write \[\[left"),
+        ({"covered": "[[0, 400.5, 640, 480]]"}, r"covered has \[0, 400.5, 640, 480\]; write"),
+        ({"covered": "[[0, 0, 641, 9]]"}, r"covered has \[0, 0, 641, 9\], no part of the image"),
+        ({"covered": "[[9, 0, 9, 9]]"}, r"covered has \[9, 0, 9, 9\], no part of the image"),
         ({"focal": "500"}, "unknown key 'focal'; the keys are width"),
         ({"fx": "[1, 2"}, "line 4: .*; write e.g."),
     ],

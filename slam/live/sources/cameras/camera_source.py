@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Floats, Image
-from bmask_slam.graph.camera import Camera, distortion_terms
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.lens import distortion_terms
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.sources.pairing import RGB, GapMeter, StreamClock
 from bmask_slam.live.sources.source import MeasuredSource, SourceCounts

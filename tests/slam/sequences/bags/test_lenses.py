@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from recorded_bags import BagMaker, camera_info, image
 
-from bmask_slam.graph.camera import Camera, distortion_terms
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.lens import distortion_terms
 from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.ros2_source import Ros2Options, Ros2Source
 from bmask_slam.sequences.bags.bag_file import open_bag

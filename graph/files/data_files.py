@@ -14,7 +14,7 @@ def data_path(*parts: str) -> Path:
     Raises:
         InputError: there is no such file; the message lists what is there.
     """
-    root = Path(__file__).resolve().parents[1] / "data"
+    root = Path(__file__).resolve().parents[2] / "data"
     if not root.is_dir():
         raise InputError(f"{root}: the project's data folder is missing; install it again")
     path = root.joinpath(*parts)
