@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bmask_slam.back_end.reinterpretation import KeyframeMotion, reinterpret_frames, use_camera
+from bmask_slam.features.brisk import BriskExtractor
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import quaternion_from_rotation
 from bmask_slam.graph.sensors.streams import Measurements, measurements
+from bmask_slam.moving.moving_object_filter import MovingObjectFilter
 from bmask_slam.system_results import SystemResults
 from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.world.frame_observations import FrameObservations
@@ -106,6 +108,8 @@ class SensorSystem(SystemResults, SensorInput):
     """
 
     camera_tracker: CameraTracker
+    extractor: BriskExtractor
+    moving_objects: MovingObjectFilter
     frame_observations: FrameObservations
 
     def add_measurements(self, new: Measurements) -> None:
@@ -136,6 +140,19 @@ class SensorSystem(SystemResults, SensorInput):
         reinterpret_frames(self.frame_observations, frame_motions or {}, self.camera, camera)
         self.camera = self.camera_tracker.tracker.camera = camera
         self._map_uses_camera(camera, motions)
+
+    def leave_out(self, camera: Camera) -> None:
+        """Find nothing more in what this camera says is covered; nothing else may differ in it.
+
+        The next keyframe begins a segment. The map of before may have been bent by what is covered,
+        so its landmarks leave the graph, and nothing is recognised by them.
+        """
+        self.camera = self.camera_tracker.tracker.camera = camera
+        self.extractor.leave_out(camera)
+        self.moving_objects.leave_out(camera)
+        self.map.prune_landmarks(np.flatnonzero(self.map.world.landmarks.in_map))
+        self.camera_tracker.reset(0)
+        self.camera_tracker.begin_apart()
 
     def _map_uses_camera(self, camera: Camera, motions: Mapping[int, KeyframeMotion]) -> None:
         use_camera(self.mapper, camera, motions)

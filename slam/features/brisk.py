@@ -113,6 +113,11 @@ class BriskExtractor:
         thresholds = (*config.thresholds, *config.faint_thresholds)
         self._fast = {t: cv2.FastFeatureDetector_create(t) for t in thresholds}
 
+    def leave_out(self, camera: Camera) -> None:
+        """Find nothing in what this camera says is covered."""
+        seen = camera.visible(COVERED_MARGIN_PX) if camera.covered else None
+        self._visible = None if seen is None else seen.astype(np.uint8)
+
     def extract(self, frame: Frame) -> Features:
         """The features of a frame. Pure: the same frame gives the same arrays."""
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)

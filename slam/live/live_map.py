@@ -46,7 +46,8 @@ class LiveMap(SensorInput):
     def calibration(self) -> str:
         """What was found of the camera, in one line; "" if nothing, or if it was not tried."""
         found = self._system.calibration
-        return "" if found is None else found.text
+        texts = "" if found is None else found.text, self._system.covered
+        return "; ".join(filter(None, texts))
 
     def trajectory(self) -> Trajectory:
         """Every frame of the largest map segment so far, from the keyframes' present poses."""

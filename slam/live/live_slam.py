@@ -6,12 +6,13 @@ import logging
 import tempfile
 import time
 from contextlib import ExitStack, closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation import Row
+from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -22,7 +23,6 @@ from bmask_slam.live.recorder import Recorder, rescued
 from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.live.sources.source_clock import SourceClock
 from bmask_slam.live.start import LiveOptions, start_system
-from bmask_slam.live.system import Prepared
 from bmask_slam.run_folder import metrics
 from bmask_slam.run_folder.folder import HEALTH, RunFolder
 from bmask_slam.run_folder.metrics import RunCounters, row
@@ -39,6 +39,21 @@ logger = logging.getLogger(__name__)
 
 DENSE_FINISH_S = 600.0
 """Longest time that the dense map may take to finish at the end."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A frame's features, extracted ahead of tracking.
+
+    Attributes:
+        features: as of ``SlamSystem.prepare``.
+        ms: time that they took.
+        arrived_s: ``time.monotonic()`` when the frame arrived, from which its latency counts.
+    """
+
+    features: Features
+    ms: float
+    arrived_s: float
 
 
 class LiveSlam(LiveMap):

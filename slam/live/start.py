@@ -18,6 +18,7 @@ from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.processes.remote_calibration import RemoteCalibration
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.system import LiveSystem
+from bmask_slam.moving.covered_parts import CoveredWatch
 from bmask_slam.run_folder.origin import Origin
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
@@ -154,5 +155,7 @@ def start_system(
             calibration = start_calibration(camera, config, options)
             undo.callback(calibration.close)
         system = LiveSystem(camera, config, place, segmenter, dense, calibration)
+        if options.calibrate != "off" and not camera.covered:
+            system.watch = CoveredWatch()
         undo.pop_all()
         return system

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from bmask_slam.live.processes.remote_calibration import RemoteCalibration
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
+from bmask_slam.moving.covered_parts import CoveredWatch
 from bmask_slam.runtime.memory import short_pauses
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import LabelsOnly
@@ -49,21 +50,6 @@ REFRESH_FRAMES = 5
 """Where no keyframes are made, the local map is chosen anew after so many frames."""
 
 
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """A frame's features, extracted ahead of tracking.
-
-    Attributes:
-        features: as of ``SlamSystem.prepare``.
-        ms: time that they took.
-        arrived_s: ``time.monotonic()`` when the frame arrived, from which its latency counts.
-    """
-
-    features: Features
-    ms: float
-    arrived_s: float
-
-
 class LiveSystem(SlamSystem):
     """Tracks in the caller's process; ``finish`` fetches the map from its process.
 
@@ -72,6 +58,7 @@ class LiveSystem(SlamSystem):
         segmenter: the process that makes masks, if any.
         dense: the process that makes submaps, if any.
         calibration: the process that estimates the camera, if any.
+        watch, covered: looks for what does not show the room in the images; what it found.
         label_names: the segmenter's classes by number.
         mask_listeners: called with the masks of each keyframe as they arrive.
     """
@@ -88,6 +75,8 @@ class LiveSystem(SlamSystem):
         calibration: RemoteCalibration | None = None,
     ) -> None:
         self.segmenter, self.dense, self.calibration = segmenter, dense, calibration
+        self.watch: CoveredWatch | None = None
+        self.covered = ""
         self._measured: deque[Measurements] = deque()
         self._own_factors = -1
         self._located = 0
@@ -107,10 +96,21 @@ class LiveSystem(SlamSystem):
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
         """Apply the other processes' results, then do the same step as offline."""
         self.catch_up()
-        result = super().process(frame, features)
+        found = self.watch.look(frame, self.camera) if self.watch is not None else None
+        if found is not None:
+            self._found_covered(*found)
+        result = super().process(frame, features if found is None else None)
         if self.calibration is not None:
             self.calibration.add_frame(frame, self._keyframe(result))
         return result
+
+    def _found_covered(self, camera: Camera, text: str) -> None:
+        """Leave it out, if the camera is not only told about, in a segment that it has not bent."""
+        self.watch, adopts = None, self.calibration is None or self.calibration.adopts
+        self.covered = f"{text}: {'left out' if adopts else 'found, not left out'}"
+        self.events.calibration(self.covered)
+        if adopts:
+            self.leave_out(camera)
 
     def _keyframe(self, result: FrameResult) -> Keyframe | None:
         """The keyframe that a frame has become, if it has."""
@@ -161,9 +161,11 @@ class LiveSystem(SlamSystem):
             if answer is not None:
                 if answer.camera is not None:
                     paths = self.remote.history.trajectories(self.remote.world)
-                    cameras = self.camera, answer.camera
-                    moved = motions_without_images(self.frame_observations, paths, *cameras)
-                    self.use_camera(answer.camera, answer.motions, moved)
+                    camera = replace(answer.camera, covered=self.camera.covered)
+                    moved = motions_without_images(
+                        self.frame_observations, paths, self.camera, camera
+                    )
+                    self.use_camera(camera, answer.motions, moved)
                 self.events.calibration(self.calibration.text)
 
     def _follow_map(self, reference: Keyframe, T_before: Array) -> None:

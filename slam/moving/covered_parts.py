@@ -17,6 +17,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Floats, Image, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.sequences.frame import Frame
 from bmask_slam.sequences.sequence import Sequence
 
 WIDTH_PX, CELL_PX = 320, 8
@@ -37,6 +38,8 @@ RESTLESS, MAX_RESTLESS = 0.3, 0.02
 """Of the other cells so small a share may stand still in more than so many of the pairs."""
 MAX_COVERED = 0.7
 WHAT = "the robot itself, an overlay or dirt on the lens"
+
+Rectangles = tuple[tuple[int, int, int, int], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +110,29 @@ def _reached(candidates: Image, seeds: Mask) -> Mask:
     return np.asarray((candidates > 0) & np.isin(parts, np.unique(parts[seeds])))
 
 
+class CoveredWatch:
+    """Looks at the images of a camera that runs, until something is found or surely nothing is."""
+
+    def __init__(self) -> None:
+        self._parts, self._due = CoveredParts(), FEWEST
+        self._last: tuple[float, Cells | None] = (-np.inf, None)
+
+    def look(self, frame: Frame, camera: Camera) -> tuple[Camera, str] | None:
+        """The camera with what is covered, and that in words, once it is known."""
+        (then_s, before), now_s = self._last, frame.timestamp_s
+        if now_s - then_s < APART_S or self._due > PAIRS:
+            return None
+        cells = Cells.of(frame.rgb)
+        if before is not None and now_s - then_s <= MAX_APART_S:
+            self._parts.add(before, cells)
+        self._last = now_s, cells
+        if self._parts.pairs < self._due:
+            return None
+        self._due *= 2
+        parts = rectangles_of(self._parts.cells(), (camera.width, camera.height))
+        return _told(camera, parts) if parts else None
+
+
 def covered_camera(sequence: Sequence, frames: range) -> tuple[Camera, str]:
     """The camera of a sequence with what these frames show of ``covered``, and that in words.
 
@@ -115,15 +141,17 @@ def covered_camera(sequence: Sequence, frames: range) -> tuple[Camera, str]:
     camera, stamps_s = sequence.camera, sequence.timestamps_s[np.array(frames, np.int64)]
     size = camera.width, camera.height
     parts = find_covered_parts(lambda k: sequence.rgb(frames[k]), stamps_s, size)
-    if not parts:
-        return camera, ""
+    return _told(camera, parts) if parts else (camera, "")
+
+
+def _told(camera: Camera, parts: Rectangles) -> tuple[Camera, str]:
     found = replace(camera, covered=parts)
     return found, f"{1 - found.visible().mean():.1%} of the image never moves: {WHAT}"
 
 
 def find_covered_parts(
     read: Callable[[int], Image], stamps_s: Array, size: tuple[int, int]
-) -> tuple[tuple[int, int, int, int], ...]:
+) -> Rectangles:
     """The covered parts of images (width, height) in a recording, as ``Camera.covered``.
 
     Args:
@@ -160,7 +188,7 @@ def _spread_order(count: int) -> Ints:
     return order[order < count]
 
 
-def rectangles_of(cells: Mask, size: tuple[int, int]) -> tuple[tuple[int, int, int, int], ...]:
+def rectangles_of(cells: Mask, size: tuple[int, int]) -> Rectangles:
     """Cells (R, C) as rectangles of images (width, height): runs of a row, joined downward."""
     scale = size[0] / WIDTH_PX * CELL_PX
     found: list[tuple[int, int, int, int]] = []

@@ -74,6 +74,10 @@ class MovingObjectFilter:
             camera, self._check, self.priors, config.movability.step, config.min_judged
         )
 
+    def leave_out(self, camera: Camera) -> None:
+        """Find no other features in what this camera says is covered."""
+        self._replenishment.extractor.leave_out(camera)
+
     def filter(self, frame: Frame, features: Features) -> StaticFeatures:
         """A frame's features (N,) without those on moving things, and others in their place.
 

@@ -54,7 +54,7 @@ class FeatureReplenishment:
     """Searches a frame for more keypoints. It holds its own detector: use one per thread."""
 
     def __init__(self, camera: Camera, config: FeatureConfig) -> None:
-        self._extractor = BriskExtractor(camera, config)
+        self.extractor = BriskExtractor(camera, config)
 
     def replenished(
         self,
@@ -73,6 +73,6 @@ class FeatureReplenishment:
         share = moving.mean()
         if share < LEAST_SHARE:
             return left
-        reserve = self._extractor.reserve(frame, features, min(share, MOST_SHARE))
+        reserve = self.extractor.reserve(frame, features, min(share, MOST_SHARE))
         still = np.flatnonzero(~judge(reserve))[: len(features) - len(left)]
-        return joined(left, self._extractor.described(select(reserve, still)))
+        return joined(left, self.extractor.described(select(reserve, still)))

@@ -8,6 +8,7 @@ import re
 from collections.abc import Container
 from dataclasses import astuple
 from pathlib import Path
+from typing import Any
 
 from bmask_slam.graph.camera import (
     MAX_SIDE_PX,
@@ -255,7 +256,7 @@ def _up(path: Path, value: object) -> str:
 
 def _covered(path: Path, value: object) -> tuple[tuple[int, int, int, int], ...]:
     """Rectangles of the image."""
-    rectangles: list[list[int]] = value if isinstance(value, list) else [value]
+    rectangles: list[Any] = value if isinstance(value, list) else [value]
     for one in rectangles:
         if not (isinstance(one, list) and len(one) == 4 and all(type(e) is int for e in one)):
             raise InputError(f"{path}: covered has {one!r}; {COVERED_CURE}")

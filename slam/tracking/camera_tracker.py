@@ -152,10 +152,14 @@ class CameraTracker:
         waits = self.lost_frames <= self._relocalisation.patience_frames or not can_begin
         if waits or tracked.status is not TrackingStatus.LOST:
             return tracked
-        self.segment = 1 + max(k.segment for k in self._map.world.keyframes.values())
+        self.begin_apart()
+        return untracked(np.eye(4), features)
+
+    def begin_apart(self) -> None:
+        """Let the next keyframe begin a segment of its own."""
+        self.segment = 1 + max((k.segment for k in self._map.world.keyframes.values()), default=-1)
         self.reference = None
         self.restart(np.eye(4))
-        return untracked(np.eye(4), features)
 
     def track_in_map(self, features: Features, everywhere: bool = False) -> Tracked:
         """The pose by constant velocity and the local map; when lost, by the segment's keyframes.
