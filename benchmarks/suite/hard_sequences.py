@@ -1,4 +1,4 @@
-"""Hard inputs from recorded and rendered sequences: faster, blurred, dark.
+"""Hard inputs from recorded and rendered sequences: faster, blurred, dark, with a robot in view.
 
 They are written as folders in TUM layout.
 """
@@ -36,6 +36,8 @@ class Hardship:
         shutter: blur along the image motion, as a share of the motion to the next kept frame.
         box_px: side of a box that blurs BURST frames in every BURST + PAUSE.
         light: share of the light that there was, with noise of DARK_NOISE grey levels.
+        body: share of the image's height, from below, that a patterned body on the camera fills.
+        depth_noise: standard deviation of noise in depth, over its square, in 1/m.
         fps: frame rate [Hz] that the kept frames get, so that the camera moves faster.
     """
 
@@ -44,6 +46,8 @@ class Hardship:
     shutter: float = 0.0
     box_px: int = 0
     light: float = 1.0
+    body: float = 0.0
+    depth_noise: float = 0.0
     fps: float | None = None
 
 
@@ -77,7 +81,7 @@ def make_hard(source: Path, hardship: Hardship, out: Path) -> Path:
 
 
 def _disturbed(sequence: Sequence, kept: list[int], hardship: Hardship) -> Iterator[Frame]:
-    """The kept frames with blur, and in less light."""
+    """The kept frames with blur, in less light, with a body and noise."""
     for k, index in enumerate(kept):
         frame = sequence.load(index)
         if hardship.box_px and k % (BURST + PAUSE) >= PAUSE:
@@ -92,6 +96,15 @@ def _disturbed(sequence: Sequence, kept: list[int], hardship: Hardship) -> Itera
             noise = np.random.default_rng(k).normal(0, DARK_NOISE, frame.rgb.shape)
             dark = np.clip(np.rint(hardship.light * frame.rgb + noise), 0, 255)
             frame = replace(frame, rgb=dark.astype(np.uint8))
+        if hardship.body:
+            rgb = frame.rgb.copy()
+            visible = rgb[round((1 - hardship.body) * len(rgb)) :]
+            visible[:] = np.random.default_rng(1).integers(0, 255, visible.shape)
+            frame = replace(frame, rgb=rgb)
+        if hardship.depth_noise:
+            noise = np.random.default_rng(k).normal(0, hardship.depth_noise, frame.depth_m.shape)
+            depth_m = frame.depth_m + noise * frame.depth_m**2
+            frame = replace(frame, depth_m=depth_m.astype(np.float32))
         yield frame
 
 

@@ -37,6 +37,7 @@ from bmask_slam.sequences.cameras import read_camera, write_camera
 from bmask_slam.system_config import SystemConfig
 
 KINECT_V1 = {"rolling_shutter_s": 0.022, "depth_time_offset_s": -0.0145}
+UNKNOWN = {"rolling_shutter_s": 0.0, "depth_time_offset_s": 0.0}
 XTION = {"rolling_shutter_s": 0.0248}
 READOUT_S = 0.02
 """Of rendered rooms."""
@@ -88,6 +89,14 @@ INPUTS = {
     "rpy-dark": Input("tum_fr1_rpy", Hardship(light=0.2), timing=KINECT_V1),
     "bonn-dark": Input("bonn_crowd", Hardship(light=0.2), timing=XTION),
     "kitchen-dark": Input("redkitchen", Hardship(max_frames=300, light=0.2), hand_eye=True),
+    "rpy-body": Input("tum_fr1_rpy", Hardship(body=1 / 6), timing=UNKNOWN),
+    "kitchen-body": Input(
+        "redkitchen", Hardship(max_frames=300, body=1 / 6), timing=UNKNOWN, hand_eye=True
+    ),
+    "rpy-depth-noise": Input("tum_fr1_rpy", Hardship(depth_noise=0.006), timing=UNKNOWN),
+    "kitchen-depth-noise": Input(
+        "redkitchen", Hardship(max_frames=300, depth_noise=0.006), timing=UNKNOWN, hand_eye=True
+    ),
     "kitchen": Input("redkitchen", hand_eye=True),
     "office": Input("office"),
 }

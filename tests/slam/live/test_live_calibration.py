@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 from contextlib import closing
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from faults import LONG_S
@@ -14,6 +16,8 @@ from recorded_bags import DEPTH, INFO, RGB, BagMaker, image
 
 from bmask_slam.calibration.adoption import SelfCalibrationConfig
 from bmask_slam.config.configuration import resolve
+from bmask_slam.evaluation.ate_rpe import evaluate_trajectory
+from bmask_slam.events import EventKind
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live import live_map, start, system
 from bmask_slam.live import play as play_module
@@ -24,6 +28,7 @@ from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.source import RecordedSource
 from bmask_slam.live.start import LiveOptions
 from bmask_slam.run_folder.map_file import read_map, read_run
+from bmask_slam.run_folder.reader import Run
 from bmask_slam.sequences.cameras import read_camera
 from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system_config import SystemConfig
@@ -67,6 +72,37 @@ def test_a_delay_is_found_and_used(late_sweep, sweep_camera, short_stretch, tmp_
     told = played(late, tmp_path / "told", "report")
     assert told.calibration.endswith("found, not applied")
     assert told.camera.depth_time_offset_s == 0 and not (tmp_path / "told/camera.yaml").exists()
+
+
+@pytest.fixture
+def robot(late_sweep, tmp_path) -> Sequence:
+    """The sweep, seen by a robot that sees itself in the lower sixth of the image."""
+    folder = shutil.copytree(late_sweep, tmp_path / "robot")
+    spots = np.random.default_rng(1).integers(0, 255, (10, 80, 3)).astype(np.uint8)
+    body = cv2.resize(spots, (320, 40), interpolation=cv2.INTER_NEAREST)
+    for file in sorted((folder / "rgb").iterdir()):
+        rgb = cv2.imread(str(file))
+        rgb[200:] = body
+        cv2.imwrite(str(file), rgb)
+    return open_sequence(folder)
+
+
+def test_a_robot_that_sees_itself_leaves_itself_out(robot, short_stretch, tmp_path) -> None:
+    slam = played(robot, tmp_path / "run", "auto")
+    ((left, top, right, bottom),) = slam.camera.covered
+    assert (left, right, bottom) == (0, 320, 240) and 196 <= top <= 204
+    assert "dirt on the lens: left out" in slam.calibration
+    run = tmp_path / "run"
+    assert read_camera(run / "camera.yaml") == read_map(run)[1] == slam.camera
+    anew = [e for e in Run(run).events if e.kind is EventKind.SEGMENT]
+    assert len(anew) == 2 and anew[1].timestamp_s < robot.timestamps_s[len(robot) // 2]
+    paths = read_run(run).trajectories
+    assert paths["trajectory.txt"].timestamps_s[0] == pytest.approx(anew[1].timestamp_s)
+    assert robot.groundtruth is not None
+    errors = evaluate_trajectory(paths["trajectory.txt"], robot.groundtruth)
+    assert errors.value("ate_rmse") < 0.02
+    told = played(robot, tmp_path / "told", "report")
+    assert told.calibration.endswith("found, not left out") and not told.camera.covered
 
 
 def test_a_source_that_pairs_images_gets_the_delay_that_edges_show(
