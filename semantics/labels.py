@@ -7,8 +7,8 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.graph.files.reading import read_lines
 
 BACKGROUND = "background"

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Mask
-from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.graph.files.yaml_file import read_yaml
 from bmask_slam.semantics.labels import LabelSet
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask
-from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import check_ids
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.graph.files.yaml_file import read_yaml
 from bmask_slam.semantics.labels import UNKNOWN, LabelSet
 

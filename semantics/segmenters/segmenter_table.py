@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.graph.errors import InputError, did_you_mean
 from bmask_slam.graph.extras import import_extra
+from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.semantics.labels import LabelSet, read_label_set
 from bmask_slam.semantics.segmenters.own_class import OwnClass, names_class, own_segmenter
 from bmask_slam.semantics.segmenters.segmenter import (
