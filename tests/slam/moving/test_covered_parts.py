@@ -91,6 +91,18 @@ def test_a_camera_at_rest_shows_nothing() -> None:
     assert found(lambda _: with_robot(3)) == ()
 
 
+def test_a_camera_that_drives_straight_on_keeps_what_is_ahead() -> None:
+    wall = texture(7, 1920, 1440)
+
+    def read(k: int) -> Image:
+        share = 0.95 - 0.55 * (k % 30) / 30
+        width, height = round(1920 * share), round(1440 * share)
+        left, top = (1920 - width) // 2, (1440 - height) // 2
+        return cv2.resize(wall[top : top + height, left : left + width], SIZE)
+
+    assert found(read) == ()
+
+
 def test_a_robot_that_rests_most_of_the_time_is_found() -> None:
     stamps_s = np.arange(1200) / 10
 
