@@ -68,7 +68,7 @@ def add_run(commands: Commands) -> None:
     add_config_arguments(parser)
     parser.add_argument("--print-config", action="store_true", help="print it resolved, and end")
     add_camera_argument(parser)
-    text = "find readout time and depth delay from the motion; auto: use them (default: auto)"
+    text = "find readout, depth delay and what covers the image; auto: use them (default: auto)"
     parser.add_argument("--calibrate", metavar="auto|off|report", help=text)
     parser.add_argument("--reference", type=Path, metavar="F", help="trajectory to compare to")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
