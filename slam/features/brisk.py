@@ -107,9 +107,8 @@ class BriskExtractor:
         self._depth_noise = camera.noise_of_depth(config.disparity_sigma_px)
         self._describer = FixedSizeBrisk(FINEST_SIZE_PX)
         self._border_px = max(config.border_px, self._describer.reach_px)
-        self._visible = (
-            camera.visible(COVERED_MARGIN_PX).astype(np.uint8) if camera.covered else None
-        )
+        self._visible: Bytes | None = None
+        self.leave_out(camera)
         thresholds = (*config.thresholds, *config.faint_thresholds)
         self._fast = {t: cv2.FastFeatureDetector_create(t) for t in thresholds}
 

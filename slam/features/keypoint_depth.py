@@ -11,7 +11,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Floats, Mask
+from bmask_slam.graph.arrays import Array, Floats
 
 NOISE_STEP_PX, MIN_NOISE_WINDOWS, SMOOTH_SHARE = 48, 30, 0.1
 SMOOTH_IQR_SIGMAS = 0.9  # lower decile of the interquartile range of 25 values of normal noise
@@ -85,16 +85,18 @@ def _depth_windows(depth_m: Floats, pixels: Array, radius: int) -> tuple[Array, 
 def _noise_per_m(depth_m: Floats, radius: int) -> float:
     """Noise c of the pixels of a depth image, sigma_z = c z^2, as of a disparity; 0 if unknown.
 
-    By windows on a grid over the image, of which the smoothest tenth shows little but noise.
+    By windows on a grid over the image, the smoothest tenth of which shows little but noise.
     """
     height, width = depth_m.shape
     v, u = np.mgrid[NOISE_STEP_PX // 2 : height : NOISE_STEP_PX, 0:width:NOISE_STEP_PX]
     median, spread, _ = _depth_windows(depth_m, np.column_stack([u.ravel(), v.ravel()]), radius)
-    seen = 2 * spread / median**2
-    seen = seen[np.isfinite(seen)]
-    if len(seen) < MIN_NOISE_WINDOWS:
-        return 0.0
-    return float(np.quantile(seen, SMOOTH_SHARE)) / SMOOTH_IQR_SIGMAS
+    return _of_the_smoothest(2 * spread / median**2) / SMOOTH_IQR_SIGMAS
+
+
+def _of_the_smoothest(spreads: Array) -> float:
+    """The lower decile of the spreads (N,) of windows, NaN where unknown; 0 if few are known."""
+    known = spreads[np.isfinite(spreads)]
+    return float(np.quantile(known, SMOOTH_SHARE)) if len(known) >= MIN_NOISE_WINDOWS else 0.0
 
 
 def smooth_value(image: Array, pixels: Array, sigmas: Array) -> tuple[Array, Array, Array]:
@@ -106,20 +108,10 @@ def smooth_value(image: Array, pixels: Array, sigmas: Array) -> tuple[Array, Arr
     values, offsets = _windows(image, pixels, VALUE_RADIUS_PX)
     plane, error = _fit_planes(values, offsets)
     rms = np.sqrt(np.nansum(error**2, axis=1) / error.shape[1])
-    max_step = MAX_STEP_SIGMAS * _noise_share(rms / sigmas, np.isfinite(plane[:, 0])) * sigmas
+    noise = _of_the_smoothest(np.where(np.isfinite(plane[:, 0]), rms / sigmas, np.nan))
+    max_step = MAX_STEP_SIGMAS * max(1.0, noise) * sigmas
     smooth = np.nanmax(np.abs(error), axis=1, initial=0.0) < max_step
     return np.where(smooth[:, None], plane, np.nan), np.where(smooth, rms, np.nan), max_step
-
-
-def _noise_share(share: Array, valid: Mask) -> float:
-    """The noise of an image by the shares of the sensor's that windows (M,) have; 1 if lower.
-
-    The smoothest tenth of the windows shows little but noise.
-    """
-    seen = share[valid]
-    return (
-        max(1.0, float(np.quantile(seen, SMOOTH_SHARE))) if len(seen) >= MIN_NOISE_WINDOWS else 1.0
-    )
 
 
 def mean_on_plane(

@@ -27,7 +27,7 @@ from bmask_slam.live.processes.remote_calibration import RemoteCalibration
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
-from bmask_slam.moving.covered_parts import CoveredWatch
+from bmask_slam.moving.covered_parts import CoveredWatch, with_verdict
 from bmask_slam.runtime.memory import short_pauses
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import LabelsOnly
@@ -107,7 +107,7 @@ class LiveSystem(SlamSystem):
     def _found_covered(self, camera: Camera, text: str) -> None:
         """Leave it out, if the camera is not only told about, in a segment that it has not bent."""
         self.watch, adopts = None, self.calibration is None or self.calibration.adopts
-        self.covered = f"{text}: {'left out' if adopts else 'found, not left out'}"
+        self.covered = with_verdict(text, adopts)
         self.events.calibration(self.covered)
         if adopts:
             self.leave_out(camera)

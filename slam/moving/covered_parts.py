@@ -17,7 +17,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Floats, Image, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.frame import Frame, check_frame
 from bmask_slam.sequences.sequence import Sequence
 
 WIDTH_PX, CELL_PX = 320, 8
@@ -118,11 +118,15 @@ class CoveredWatch:
         self._last: tuple[float, Cells | None] = (-np.inf, None)
 
     def look(self, frame: Frame, camera: Camera) -> tuple[Camera, str] | None:
-        """The camera with what is covered, and that in words, once it is known."""
+        """The camera with what is covered, and that in words, once it is known.
+
+        Raises:
+            InputError: as `check_frame`.
+        """
         (then_s, before), now_s = self._last, frame.timestamp_s
         if now_s - then_s < APART_S or self._due > PAIRS:
             return None
-        cells = Cells.of(frame.rgb)
+        cells = Cells.of(check_frame(frame, camera).rgb)
         if before is not None and now_s - then_s <= MAX_APART_S:
             self._parts.add(before, cells)
         self._last = now_s, cells
@@ -147,6 +151,11 @@ def covered_camera(sequence: Sequence, frames: range) -> tuple[Camera, str]:
 def _told(camera: Camera, parts: Rectangles) -> tuple[Camera, str]:
     found = replace(camera, covered=parts)
     return found, f"{1 - found.visible().mean():.1%} of the image never moves: {WHAT}"
+
+
+def with_verdict(text: str, used: bool) -> str:
+    """What was found, and what became of it."""
+    return f"{text}: {'left out' if used else 'found, not left out'}"
 
 
 def find_covered_parts(

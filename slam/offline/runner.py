@@ -25,7 +25,7 @@ from bmask_slam.graph.sensors.streams import read_folder
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps
 from bmask_slam.labelling.mask_memory import MaskMemory, RememberingSegmenter
 from bmask_slam.labelling.upright_images import upright_of
-from bmask_slam.moving.covered_parts import covered_camera
+from bmask_slam.moving.covered_parts import covered_camera, with_verdict
 from bmask_slam.offline.checkpoint import Checkpoint, read_checkpoint
 from bmask_slam.offline.frame_loop import ActiveRun, process_frames, run_indices
 from bmask_slam.offline.map_localisation import MapLocalisation
@@ -145,9 +145,10 @@ def _without_covered_parts(options: RunOptions, sequence: Sequence) -> tuple[Seq
     if options.calibrate == "off" or sequence.camera.covered:
         return sequence, ""
     camera, text = covered_camera(sequence, run_indices(sequence, options))
-    if not text or options.calibrate == "report":
-        return sequence, text and f"{text}: found, not left out"
-    return sequence.with_camera(camera), f"{text}: left out"
+    if not text:
+        return sequence, ""
+    used = options.calibrate == "auto"
+    return sequence.with_camera(camera) if used else sequence, with_verdict(text, used)
 
 
 def _calibrator(

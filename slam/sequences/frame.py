@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bmask_slam.graph.arrays import Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.sequences.images import without_covered
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def check_frame(frame: Frame, camera: Camera, last_stamp_s: float = -math.inf) -
         )
     depth_m = _checked_depth(frame.depth_m, where)
     if camera.covered:
-        depth_m = np.where(camera.visible(), depth_m, np.float32(np.nan))
+        depth_m = without_covered(depth_m.copy(), camera)
     return replace(frame, depth_m=depth_m)
 
 

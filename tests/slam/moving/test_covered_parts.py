@@ -19,9 +19,10 @@ from bmask_slam.evaluation import plot
 from bmask_slam.graph.arrays import Image, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.moving.covered_parts import find_covered_parts, rectangles_of
+from bmask_slam.moving.covered_parts import CoveredWatch, find_covered_parts, rectangles_of
 from bmask_slam.offline.runner import RunOptions, resume, run
 from bmask_slam.sequences.cameras import read_camera
+from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 
 SIZE = 640, 480
@@ -137,6 +138,14 @@ def test_few_pairs_and_broken_images() -> None:
         return with_robot(k)
 
     assert found(read) == (STRIP,)
+
+
+def test_a_frame_of_another_size_is_refused_as_by_tracking() -> None:
+    watch, camera = CoveredWatch(), Camera(*SIZE, 500, 500, 320, 240)
+    depth_m = np.ones(SIZE[::-1], np.float32)
+    assert watch.look(Frame(0, 0.0, with_robot(0), depth_m), camera) is None
+    with pytest.raises(InputError, match="resize it, or correct the camera"):
+        watch.look(Frame(1, 0.5, with_robot(1)[:99], depth_m), camera)
 
 
 @pytest.mark.parametrize(
