@@ -90,6 +90,7 @@ class SlamSystem(SavedSystem):
             InputError: the frame does not fit the camera, or its stamp does not go forward.
         """
         frame = self._begin(frame)
+        self._use_masks()
         features = self._extract(frame, features)
         self._look(frame, features)
         static = self._without_moving(frame, features)
@@ -133,6 +134,7 @@ class SlamSystem(SavedSystem):
 
     def finish(self) -> None:
         """The last optimisation; the map is then final."""
+        self.semantics.use_masks(everything=True)
         if self.config.final_adjustment:
             self.mapper.finish()
             self._adjust_frames()
@@ -156,6 +158,10 @@ class SlamSystem(SavedSystem):
         self.camera_tracker.begin_frame(frame.timestamp_s)
         self.events.begin_frame(frame.index, frame.timestamp_s)
         return frame
+
+    @stage("semantics")
+    def _use_masks(self) -> None:
+        self.semantics.begin_frame()
 
     @stage("features")
     def _extract(self, frame: Frame, features: Features | None) -> Features:

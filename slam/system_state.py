@@ -21,7 +21,8 @@ class SavedSystem(SensorSystem):
     keyframes: KeyframeDecision
 
     def state(self) -> Arrays:
-        """All that the system has learned, as named arrays."""
+        """All that the system has learned, as named arrays; masks to come are waited for."""
+        self.semantics.use_masks(everything=True)
         return {
             **self._progress(),
             **nested(

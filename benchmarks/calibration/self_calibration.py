@@ -23,10 +23,10 @@ import numpy as np
 from benchmarks.pages import table
 from benchmarks.paths import KITCHEN
 from bmask_slam.calibration.calibrate import CalibrateOptions, calibrate_run
-from bmask_slam.calibration.report import NORMAL_95, Calibrated, format_calibration
+from bmask_slam.calibration.report import Calibrated, format_calibration
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import evaluate
-from bmask_slam.graph.calibration.model import PARAMETERS, parameters_of
+from bmask_slam.graph.calibration.model import NORMAL_95, PARAMETERS, parameters_of
 from bmask_slam.graph.camera import Camera
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.rendering.config import RenderConfig

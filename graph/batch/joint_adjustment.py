@@ -34,8 +34,10 @@ from bmask_slam.graph.smoother.isam2 import SolverError
 CHUNK = 4096
 """Observations that are linearised at once: some megabytes."""
 FIRST_DAMPING, LAST_DAMPING = 1e-5, 1e2
-MAX_STEPS = (5, 8)
-"""Before and after the frames' outliers are left out."""
+MAX_STEPS = (3, 4)
+"""Before and after the frames' outliers are left out: what further steps move is tenths of a mm."""
+LEAST_DECREASE = 1e-4
+"""Of the cost, relative: a step that gains less is the last."""
 CG_STEPS, CG_TOLERANCE = 150, 3e-3
 
 
@@ -138,7 +140,7 @@ class _Problem:
         """Take steps until the cost hardly falls."""
         for _ in range(max_steps):
             before = self.cost
-            if not self._improve() or before - self.cost <= self._config.least_decrease * before:
+            if not self._improve() or before - self.cost <= LEAST_DECREASE * before:
                 return
 
     def _improve(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.calibration import CalibrationConfig, calibrate
 from bmask_slam.graph.calibration.cross_validation import halves_of
-from bmask_slam.graph.calibration.model import BEND, LENS, PARAMETERS, SHUTTER, F
+from bmask_slam.graph.calibration.model import BEND, LENS, NORMAL_95, PARAMETERS, SHUTTER, F
 from bmask_slam.graph.calibration.problem import CalibrationProblem
 
 MIN_KEYFRAMES = 12
@@ -27,7 +28,8 @@ class FocalCheck:
     Attributes:
         change: share by which both focal lengths should be larger.
         sigma: its standard deviation; errors within a landmark and a stretch count as one.
-        halves: the change by either half of the keyframes alone; NaN where one is too small.
+        halves: the change by either half of the keyframes alone; NaN where one is too small, or
+            where the change of the whole is within its 95 % bounds, so that they are not asked for.
     """
 
     change: float
@@ -37,7 +39,7 @@ class FocalCheck:
     def surely_beyond(self, limit: float) -> bool:
         """Whether 95 % bounds, and both halves of the run by at least half, exceed a limit."""
         sign = np.sign(self.change)
-        beyond = abs(self.change) - 1.96 * self.sigma > limit
+        beyond = abs(self.change) - NORMAL_95 * self.sigma > limit
         return bool(beyond and all(sign * half > limit / 2 for half in self.halves))
 
 
@@ -65,8 +67,10 @@ def check_focal(problem: CalibrationProblem) -> FocalCheck | None:
 
 def _in_whole_and_halves(problem: CalibrationProblem) -> FocalCheck:
     change, sigma = _common_change(problem)
+    if abs(change) <= NORMAL_95 * sigma:
+        return FocalCheck(change, sigma, (math.nan, math.nan))
     halves = halves_of(problem)
-    first, second = (_common_change(half)[0] if half else float("nan") for half in halves)
+    first, second = (_common_change(half)[0] if half else math.nan for half in halves)
     return FocalCheck(change, sigma, (first, second))
 
 

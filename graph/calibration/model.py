@@ -45,6 +45,8 @@ metres, seconds, seconds, and the distortion of depth in 1/m."""
 F, C, LENS = slice(0, 2), slice(2, 4), slice(4, 9)
 FACTOR, OFFSET, TIME, SHUTTER = 9, 10, 11, 12
 BEND = slice(13, 18)
+NORMAL_95 = 1.96
+"""Standard deviations of a 95 % bound."""
 MIN_DEPTH_M = 0.05
 MIN_INVERSE_DEPTH = 0.01
 

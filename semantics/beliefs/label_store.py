@@ -181,18 +181,19 @@ class LabelStore:
 
     def _log_missed(self, ids: Ints) -> Array:
         """log P(misses | class) (N, C - 1) or (N, 1) of ids (N,) in the tables."""
-        if self.model is None:
-            return self.config.log_missed(self._misses[ids])
-        groups, recall = self.model.groups[1:], self.model.best_recall[1:]
-        return self.config.log_missed(self._misses[ids][:, groups], recall)
+        misses, recall = self._misses[ids], None
+        if self.model is not None:
+            misses, recall = misses[:, self.model.groups[1:]], self.model.best_recall[1:]
+        found, rows = np.zeros(misses.shape), misses.any(axis=1)  # few have any
+        found[rows] = self.config.log_missed(misses[rows], recall)
+        return found
 
     def estimates(self, ids: Ints) -> LabelEstimates:
         """The likeliest label of any ids (N,), with its probability, entropy and views."""
         p = self.probabilities(ids)
         labels = p.argmax(axis=1) if len(ids) else np.zeros(0, np.int64)
         entropy = -(p * np.log(np.maximum(p, 1e-30))).sum(axis=1)
-        views = np.zeros(len(ids), np.int64)
-        inside = ids < len(self._views)
+        views, inside = np.zeros(len(ids), np.int64), ids < len(self._views)
         views[inside] = self._views[ids[inside]]
         return LabelEstimates(labels, p[np.arange(len(ids)), labels], entropy, views)
 
@@ -264,8 +265,7 @@ class LabelStore:
         return gained
 
     def _limit_misses(self, ids: Ints) -> None:
-        limit = np.float32(self.config.recall_views)
-        self._misses[ids] = np.minimum(self._misses[ids], limit)
+        self._misses[ids] = np.minimum(self._misses[ids], np.float32(self.config.recall_views))
 
     def _reset(self, ids: Ints) -> None:
         for name in _TABLES:

@@ -124,14 +124,16 @@ class ObjectPoints:
         if sizes.max(initial=0) <= most:
             return
         order = np.lexsort((self._anchors, self._owners))  # stable
-        pairs = np.stack([self._owners, self._anchors], axis=1)[order]
-        of_view, where, counts = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
-        where = where.ravel()
-        place = np.arange(len(order)) - (np.cumsum(counts) - counts)[where]
-        views = np.bincount(of_view[:, 0], minlength=self._next_id)[of_view[:, 0]]
+        owners, anchors = self._owners[order], self._anchors[order]
+        begins = np.flatnonzero(np.diff(owners, prepend=-1) | np.diff(anchors, prepend=-1))
+        counts = np.diff(begins, append=len(order))
+        where = np.repeat(np.arange(len(begins)), counts)
+        owners, anchors = owners[begins], anchors[begins]  # of each view of an object
+        place = np.arange(len(order)) - begins[where]
+        views = np.bincount(owners, minlength=self._next_id)[owners]
         share = np.minimum(1.0, np.maximum(0.75 * most / views, 1.0) / counts)
-        share[sizes[of_view[:, 0]] <= most] = 1.0
-        phase = (of_view[:, 1] + views) * _GOLDEN % 1.0  # else always the same ones would go
+        share[sizes[owners] <= most] = 1.0
+        phase = (anchors + views) * _GOLDEN % 1.0  # else always the same ones would go
         share, phase = share[where], phase[where]
         chosen = np.floor((place + 1) * share + phase) > np.floor(place * share + phase)
         kept = np.sort(order[chosen])

@@ -20,6 +20,7 @@ from bmask_slam.evaluation import Row
 from bmask_slam.graph.calibration.focal_check import FocalCheck, check_focal
 from bmask_slam.graph.calibration.model import (
     BEND,
+    NORMAL_95,
     OFFSET,
     PARAMETERS,
     CalibrationViews,
@@ -32,7 +33,6 @@ from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.run_folder.metrics import row
 from bmask_slam.sequences.sequence import Sequence
 
-NORMAL_95 = 1.96
 MAX_KEYFRAMES = 60
 MAX_FOCAL_CHANGE, MAX_FOCAL_BOUND = 0.015, 0.02
 MAX_SHIFT_SHARE = 4 / 640

@@ -17,6 +17,7 @@ from bmask_slam.graph.arrays import Array, Floats, Image, Ints
 from bmask_slam.graph.calibration.registration import EdgeScores, strength_of
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices
+from bmask_slam.runtime.prefetch import in_threads
 from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.tracking.rolling_shutter import velocities
 
@@ -75,12 +76,13 @@ def edge_scores(sequence: Sequence, path: Trajectory) -> EdgeScores:
     """
     chosen, twists = _chosen_frames(sequence, path)
     recording, pairs, camera = sequence.recording, sequence.pairs, sequence.camera
-    frames = []
-    for i in chosen.tolist():
+
+    def edges(i: int) -> FrameEdges:
         depth_m = recording.read_depth(pairs.depth_files[i], camera).astype(float)
         rgb = recording.read_rgb(pairs.rgb_files[i], camera)
-        frames.append(FrameEdges.of(rgb, depth_m, float(pairs.lags_s[i]), camera))
-    return scores_of(frames, twists, camera)
+        return FrameEdges.of(rgb, depth_m, float(pairs.lags_s[i]), camera)
+
+    return scores_of(in_threads(edges, chosen.tolist()), twists, camera)
 
 
 def scores_of(frames: list[FrameEdges], twists: Array, camera: Camera) -> EdgeScores:

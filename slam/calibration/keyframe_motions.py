@@ -18,8 +18,9 @@ from bmask_slam.features.keypoint_depth import sample_depth
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.runtime.prefetch import in_threads
 from bmask_slam.sequences.sequence import Sequence
-from bmask_slam.world.frame_observations import FrameObservations
+from bmask_slam.world.frame_observations import FrameObservations, FrameView
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
@@ -37,26 +38,34 @@ def keyframe_motions(
     ``paths`` has the trajectory of each segment; ``depth_change`` is None if the delay of depth is
     the old one.
     """
-    motions = {}
-    for k in world.keyframes.values():
+
+    def motion(k: Keyframe) -> KeyframeMotion:
         twist = _twist_of(k.timestamp_s, paths.get(k.segment))
-        motions[k.id] = KeyframeMotion(twist, *(depth_change(k) if depth_change else ()))
-    return motions
+        return KeyframeMotion(twist, *(depth_change(k) if depth_change else ()))
+
+    keyframes = list(world.keyframes.values())
+    return dict(zip((k.id for k in keyframes), in_threads(motion, keyframes), strict=True))
 
 
 def frame_motions(
     frames: FrameObservations, paths: Mapping[int, Trajectory], depth_change: FrameChange | None
 ) -> dict[float, KeyframeMotion]:
     """The motion of the other frames, by stamp."""
-    motions = {}
+    motions: dict[float, KeyframeMotion] = {}
     for path in paths.values():
         known = set(path.timestamps_s.tolist())
         views = [view for view in frames.views if view.timestamp_s in known]
-        twists = twists_at(path, np.array([view.timestamp_s for view in views]))
-        for view, twist in zip(views, twists, strict=True):
+        stamps_s = [view.timestamp_s for view in views]
+        twists = twists_at(path, np.array(stamps_s))
+
+        def motion(seen: tuple[FrameView, Array]) -> KeyframeMotion:
+            view, twist = seen
             pixels = view.columns[:, 2:4].astype(float)
             change = depth_change(view.timestamp_s, pixels) if depth_change else ()
-            motions[view.timestamp_s] = KeyframeMotion(twist, *change)
+            return KeyframeMotion(twist, *change)
+
+        found = in_threads(motion, zip(views, twists, strict=True))
+        motions |= dict(zip(stamps_s, found, strict=True))
     return motions
 
 

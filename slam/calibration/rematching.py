@@ -25,6 +25,7 @@ from bmask_slam.calibration.views import (
     Depths,
     connected_views,
     group_sizes,
+    measured_depths,
     sensor_sigmas,
 )
 from bmask_slam.features.matching import MatchConfig, WindowIndex, match_pairs
@@ -244,11 +245,8 @@ class RunProblem:
     def _depths_at(self, found: FoundAgain, sigmas: Array) -> Depths:
         """Depth measurements at keypoints; those of the first round only, later ones have none."""
         if self._depths is None:
-            measured = Depths.missing(len(found))
-            for row, keyframe_id in enumerate(self._keyframe_ids.tolist()):
-                rows = np.flatnonzero(found.keyframes == row)
-                at = found.pixels[rows], sigmas[rows]
-                measured.put(rows, self._reader.measure(keyframe_id, *at))
+            seen = self._keyframe_ids, found.keyframes
+            measured = measured_depths(self._reader, seen, found.pixels, sigmas)
             self._depths = found.keys, measured
         keys, measured = self._depths
         order = np.argsort(keys, kind="stable")

@@ -10,10 +10,9 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.calibration import CalibrationResult
-from bmask_slam.graph.calibration.model import BEND, FACTOR, PARAMETERS
+from bmask_slam.graph.calibration.model import BEND, FACTOR, NORMAL_95, PARAMETERS
 from bmask_slam.graph.camera import Camera
 
-NORMAL_95 = 1.96
 UNOBSERVED, WEAK = 0.8, 0.4
 """Ratios of posterior and prior sigma above which a parameter is not, or weakly, observable."""
 UNITS = {

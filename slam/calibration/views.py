@@ -17,6 +17,7 @@ from bmask_slam.graph.camera import NO_DEPTH_DISTORTION, Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.trajectory import nearest_indices
+from bmask_slam.runtime.prefetch import in_threads
 from bmask_slam.sequences.images import SURFACE_STEP
 from bmask_slam.sequences.sequence import Sequence
 
@@ -93,10 +94,7 @@ def make_views(
     landmark_ids, landmarks = np.unique(observations.landmark_ids, return_inverse=True)
     pixels = camera.distort(as_exposed(observations.measurements[:, :2], motion, camera))
     nominal = sensor_sigmas(observations, camera)
-    depths = Depths.missing(len(observations))
-    for k, keyframe in enumerate(keyframe_ids.tolist()):
-        rows = np.flatnonzero(keyframes == k)
-        depths.put(rows, reader.measure(keyframe, pixels[rows], nominal[rows]))
+    depths = measured_depths(reader, (keyframe_ids, keyframes), pixels, nominal)
     views = CalibrationViews(
         keyframes=keyframes,
         landmarks=landmarks,
@@ -180,6 +178,26 @@ class DepthReader(Protocol):
         Raises:
             InputError: the depth image is missing or broken.
         """
+
+
+def measured_depths(
+    reader: DepthReader, keyframes: tuple[Ints, Ints], pixels: Array, sigmas: Array
+) -> Depths:
+    """What a reader measures at pixels (M, 2) as exposed.
+
+    ``keyframes`` are the ids (K,) of keyframes and the row in them of each pixel (M,); the inverse
+    depths have these sigmas (M,) in 1/m. Raises InputError as ``DepthReader.measure``.
+    """
+    ids, rows_of = keyframes
+
+    def measured(row: int) -> tuple[Ints, Depths]:
+        rows = np.flatnonzero(rows_of == row)
+        return rows, reader.measure(int(ids[row]), pixels[rows], sigmas[rows])
+
+    found = Depths.missing(len(pixels))
+    for rows, depths in in_threads(measured, range(len(ids))):
+        found.put(rows, depths)
+    return found
 
 
 def frames_of(stamps_s: dict[int, float], sequence: Sequence) -> dict[int, int]:

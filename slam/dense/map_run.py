@@ -24,6 +24,7 @@ from bmask_slam.graph.arrays import Image, Mask
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.growing_table import lock_file
 from bmask_slam.graph.whole_file import remove
+from bmask_slam.labelling.awaited_masks import LAG
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.labelling.upright_images import upright_of
 from bmask_slam.mapping.inverse_depth.dense_mapper import WINDOW, DenseKeyframe
@@ -32,7 +33,7 @@ from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.runtime.prefetch import prepared_ahead
 from bmask_slam.semantics.instances.instances import Instance
-from bmask_slam.semantics.segmenters.segmenter import Segmenter
+from bmask_slam.semantics.segmenters.segmenter import Segmenter, begin_early
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
 from bmask_slam.semantics.segmenters.upright import Upright
 from bmask_slam.semantics.torch_threads import one_thread
@@ -186,20 +187,25 @@ def open_fusion(options: MapOptions) -> RunFusion:
 
 
 class CachingSegmenter:
-    """A segmenter that keeps the instances of the last image, for a second caller."""
+    """A segmenter that keeps the instances of the last images, for a second caller."""
 
     def __init__(self, segmenter: Segmenter) -> None:
         self.labels = segmenter.labels
         self._segmenter = segmenter
-        self._name: str | None = None
-        self._instances: list[Instance] = []
+        self._known: dict[str, list[Instance]] = {}
+
+    def begin(self, image: Image, name: str) -> None:
+        """Begin with an image that is not known, where the segmenter works beside this process."""
+        if name not in self._known:
+            begin_early(self._segmenter, image, name)
 
     def segment(self, image: Image, name: str) -> list[Instance]:
         """The instances in an image."""
-        if name != self._name:
-            self._instances = self._segmenter.segment(image, name)
-            self._name = name
-        return self._instances
+        if name not in self._known:
+            self._known[name] = self._segmenter.segment(image, name)
+            if len(self._known) > LAG + 1:
+                del self._known[next(iter(self._known))]
+        return self._known[name]
 
 
 def dense_follower(

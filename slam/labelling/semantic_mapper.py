@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,12 @@ from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested, part
+from bmask_slam.labelling.awaited_masks import (
+    DEPTH_STEP,
+    AwaitingKeyframe,
+    MaskRequests,
+    kept_depth,
+)
 from bmask_slam.labelling.config import SemanticsConfig, above
 from bmask_slam.labelling.landmark_visibility import Observed, observed_by
 from bmask_slam.labelling.landmark_votes import LabelVotes
@@ -41,17 +46,7 @@ from bmask_slam.world.map_editor import MapReader
 
 logger = logging.getLogger(__name__)
 
-DEPTH_STEP = 2
-"""Every second pixel of a keyframe's depth image is kept until its masks arrive."""
 MAX_WAITING = 100
-
-
-@dataclass(frozen=True, eq=False)
-class _Waiting:
-    """What the masks of a keyframe will need: its stamp and its thinned depth (h, w)."""
-
-    timestamp_s: float
-    depth_m: Floats
 
 
 class SemanticMapper:
@@ -62,7 +57,7 @@ class SemanticMapper:
     """
 
     _done: set[int]
-    _waiting: dict[int, _Waiting]
+    _waiting: dict[int, AwaitingKeyframe]
 
     def __init__(
         self,
@@ -76,6 +71,7 @@ class SemanticMapper:
         self.camera, self.config = camera, config
         self.segmenter = segmenter or NoSegmenter()
         self._rays = pixel_rays(camera, DEPTH_STEP)
+        self._requests = MaskRequests()
         self._begin(self.segmenter.labels, getattr(self.segmenter, "measured", ""))
 
     @property
@@ -84,26 +80,35 @@ class SemanticMapper:
         return len(self.names) > 1
 
     def observe(self, frame: Frame, keyframe: Keyframe) -> None:
-        """Follow the map's changes, then segment a keyframe and use its masks.
+        """Follow the map's changes and ask for the masks of a keyframe; see ``use_masks``."""
+        self.follow_map()
+        if len(self.segmenter.labels) > 1:
+            self.await_masks(keyframe, kept_depth(frame.depth_m))
+            self._requests.add(keyframe.id, frame, self.segmenter)
+            self.use_masks()
+
+    def begin_frame(self) -> None:
+        """A frame begins: the masks that are due with it are used."""
+        self._requests.begin_frame()
+        self.use_masks()
+
+    def use_masks(self, everything: bool = False) -> None:
+        """Use the masks that were asked for and are due, or all.
 
         Raises:
             InputError: the first keyframe cannot be segmented; later ones are skipped.
         """
-        self.follow_map()
-        if not len(self.segmenter.labels) > 1:
-            return
-        self.await_masks(keyframe, kept_depth(frame.depth_m))
-        try:
-            instances = self.segmenter.segment(frame.rgb, frame.name)
-            self.attach(keyframe.id, instances)
-        except InputError as error:
-            if not self._done:
-                raise
-            logger.warning("keyframe %d has no masks: %s", keyframe.id, error)
+        for asked in self._requests.take(everything):
+            try:
+                self.attach(asked.keyframe_id, self.segmenter.segment(asked.image, asked.name))
+            except InputError as error:
+                if not self._done:
+                    raise
+                logger.warning("keyframe %d has no masks: %s", asked.keyframe_id, error)
 
     def await_masks(self, keyframe: Keyframe, depth_m: Floats) -> None:
         """Keep the ``kept_depth`` of a keyframe until its masks arrive."""
-        self._waiting[keyframe.id] = _Waiting(keyframe.timestamp_s, depth_m)
+        self._waiting[keyframe.id] = AwaitingKeyframe(keyframe.timestamp_s, depth_m)
         self._gravity.add(keyframe.id, depth_m, self._rays)
         if len(self._waiting) > MAX_WAITING:
             del self._waiting[min(self._waiting)]
@@ -127,7 +132,7 @@ class SemanticMapper:
         self._done.add(keyframe_id)
         self._gravity.use_side(up_of(instances))
         nothing = np.full(self._rays.shape[:2], np.nan, np.float32)
-        waiting = self._waiting.pop(keyframe_id, _Waiting(np.nan, nothing))
+        waiting = self._waiting.pop(keyframe_id, AwaitingKeyframe(np.nan, nothing))
         least, least_of_objects = self.config.least_scores(self.labels.model is not None)
         told, config = above(instances, least), self.config.votes
         everything = assign_pixels(told, waiting.depth_m, size, config, in_boxes=True)
@@ -234,7 +239,7 @@ class SemanticMapper:
         self._done = set(state["done"].tolist())
         shape = state["waiting_shape"].reshape(-1, 2)[:1].ravel().tolist() or [0, 0]
         depths_m = state["waiting_depth_m"].reshape(len(state["waiting"]), *shape)
-        waiting = map(_Waiting, state["waiting_s"].tolist(), depths_m)
+        waiting = map(AwaitingKeyframe, state["waiting_s"].tolist(), depths_m)
         self._waiting = dict(zip(state["waiting"].tolist(), waiting, strict=True))
 
     def begin_session(self) -> None:
@@ -268,7 +273,7 @@ class SemanticMapper:
 
     def _add_objects(
         self,
-        waited: tuple[int, _Waiting],
+        waited: tuple[int, AwaitingKeyframe],
         placed: tuple[PixelAssignment, Ints, Ints],
         observed: Observed,
     ) -> None:
@@ -291,8 +296,3 @@ class SemanticMapper:
             self.objects.points.reanchor(keyframe_id, observed.anchor.id, observed.T_anchor_camera)
         on = np.append(objects, -1)[instances]
         self.objects.place_landmarks(ids[on >= 0], on[on >= 0])
-
-
-def kept_depth(depth_m: Floats) -> Floats:
-    """Every DEPTH_STEP-th pixel each way of a z-depth image (H, W) in m."""
-    return depth_m[::DEPTH_STEP, ::DEPTH_STEP].copy()

@@ -184,7 +184,7 @@ def _motions(
 ) -> tuple[dict[int, KeyframeMotion], dict[float, KeyframeMotion]]:
     """By what keyframes and other frames are interpreted anew with a camera that was found."""
     offset_s, paths = camera.depth_time_offset_s, system.segments()
-    retimed = sequence.with_camera(replace(sequence.camera, depth_time_offset_s=offset_s))
+    retimed = sequence.with_delay(offset_s)
     late = offset_s != sequence.camera.depth_time_offset_s
 
     def change(stamp_s: float, pixels: Array) -> tuple[Ints, Array]:

@@ -19,6 +19,7 @@ from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import part
+from bmask_slam.labelling.awaited_masks import LAG
 from bmask_slam.labelling.mask_memory import MaskMemory
 from bmask_slam.live.messages import FramesTracked, Handled, ImageToSegment, Masks, SaveState
 from bmask_slam.live.processes.map_return import MapPlace
@@ -34,8 +35,6 @@ from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 
-LAG = 3
-"""Frames after which answers are used: about as long as the map works on a keyframe."""
 WAIT_S = 600.0
 """Longest wait for an answer."""
 

@@ -12,7 +12,7 @@ from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import check_extra
 from bmask_slam.live.messages import ImageToSegment, NotSegmented
-from bmask_slam.live.processes.segmentation import RemoteSegmenter
+from bmask_slam.live.processes.segmentation import MAX_KEPT, Queueing, RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.runtime.machine import available_cores
 from bmask_slam.semantics.instances.instances import Instance
@@ -37,7 +37,7 @@ class SegmenterBeside(RemoteSegmenter):
         measured: under what name the errors of its masks were measured, "" if they were not.
     """
 
-    niceness = 0
+    queueing = Queueing(MAX_KEPT, newest_first=False, niceness=0)
 
     def __init__(
         self, options: SegmenterOptions, sequence: Path, upright: Upright | None = None
@@ -45,13 +45,17 @@ class SegmenterBeside(RemoteSegmenter):
         """Start the process, for the images of a sequence. Raises InputError if it cannot start."""
         super().__init__(options, sequence, RestartPolicy(answer_s=ANSWER_S), upright=upright)
         self.measured = measured_name(options)
-        self._begun = 0, ""
+        self._count = 0
+        self._begun: dict[str, int] = {}
+        self._found: dict[int, list[Instance]] = {}
         self._reasons: dict[int, str] = {}
 
     def begin(self, image: Image, name: str) -> None:
-        """Begin with an image whose instances will be asked for next; returns at once."""
-        self._begun = self._begun[0] + 1, name
-        self.request(ImageToSegment(self._begun[0], image, name))
+        """Begin with an image whose instances will be asked for later; returns at once."""
+        if name not in self._begun:
+            self._count += 1
+            self._begun[name] = self._count
+            self.request(ImageToSegment(self._count, image, name))
 
     def segment(self, image: Image, name: str) -> list[Instance]:
         """The instances in an image, once they have come.
@@ -60,15 +64,13 @@ class SegmenterBeside(RemoteSegmenter):
             InputError: the image cannot be segmented, or the process died too often.
         """
         check_image(image, name)
-        if self._begun[1] != name:
-            self.begin(image, name)
-        number = self._begun[0]
-        self._begun = number, ""
-        while self.awaits(number):
-            for masks in self.receive_masks():
-                if masks.keyframe_id == number:
-                    return masks.instances
+        self.begin(image, name)
+        number = self._begun.pop(name)
+        while number not in self._found and self.awaits(number):
+            self._found |= {masks.keyframe_id: masks.instances for masks in self.receive_masks()}
             time.sleep(POLL_S)
+        if number in self._found:
+            return self._found.pop(number)
         died = f"{name}: the segmenter's process died too often"
         raise InputError(self._reasons.pop(number, died))
 

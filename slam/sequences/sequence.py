@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -23,6 +23,9 @@ from bmask_slam.sequences.prefetch import prefetched
 from bmask_slam.sequences.recording import Recording
 
 logger = logging.getLogger(__name__)
+
+DECODED = 4
+"""Depth images that are kept in memory: with a delay, the next frames need them again."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ class Sequence:
         lists = recording.rgb, recording.depth
         self.pairs = pair_images(*lists, limit_s, offset_s, recording.path)
         self._skipped: dict[int, str] = {}
-        self._read_depth = lru_cache(2)(lambda path: recording.read_depth(path, camera))
+        self._read_depth = lru_cache(DECODED)(lambda path: recording.read_depth(path, camera))
 
     def __len__(self) -> int:
         return len(self.pairs.timestamps_s)
@@ -109,6 +112,12 @@ class Sequence:
     def with_camera(self, camera: Camera) -> Sequence:
         """The same images, paired by another camera's ``depth_time_offset_s``."""
         return Sequence(self.recording, camera, self.config)
+
+    def with_delay(self, depth_time_offset_s: float) -> Sequence:
+        """The same images, paired by another delay; what is decoded for one is there for both."""
+        found = self.with_camera(replace(self.camera, depth_time_offset_s=depth_time_offset_s))
+        found._read_depth = self._read_depth
+        return found
 
     def depth(self, index: int) -> tuple[Floats, float]:
         """The depth (H, W) of a frame in metres, and its lag, as in `Frame`.

@@ -21,7 +21,7 @@ from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
 from bmask_slam.graph.files.disk_arrays import DiskRows
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.graph.smoother.storage import graph_arrays
-from bmask_slam.labelling.semantic_mapper import kept_depth
+from bmask_slam.labelling.awaited_masks import kept_depth
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.moving.static_verification import PendingMovable, Removed
 from bmask_slam.semantics.instances.instances import Instance, PackedMask, certain, mask_box

@@ -17,8 +17,8 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.sensors.streams import Measurements
+from bmask_slam.labelling.awaited_masks import kept_depth
 from bmask_slam.labelling.results import MapObjects
-from bmask_slam.labelling.semantic_mapper import kept_depth
 from bmask_slam.live.messages import (
     AddMeasurements,
     Finish,

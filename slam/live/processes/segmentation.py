@@ -1,10 +1,11 @@
-"""Segmentation of keyframes in a process of its own, the newest keyframe first."""
+"""Segmentation of keyframes in a process of its own."""
 
 from __future__ import annotations
 
 import logging
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 from bmask_slam.datasets.weights import find_weights
@@ -23,11 +24,19 @@ from bmask_slam.semantics.segmenters.upright import Upright
 
 logger = logging.getLogger(__name__)
 
-NICENESS = 15
 MAX_WAITING = 4
 """Largest number of keyframes that wait for segmentation; the oldest are skipped."""
 MAX_KEPT = 100
 """The same for a workstation, which may go away and catches up when it is back."""
+
+
+@dataclass(frozen=True)
+class Queueing:
+    """How many images may wait, which is next, and how far back the process stands for others."""
+
+    most: int = MAX_WAITING
+    newest_first: bool = True
+    niceness: int = 15
 
 
 def serve_segmenter(
@@ -35,21 +44,20 @@ def serve_segmenter(
     options: SegmenterOptions,
     sequence: Path,
     upright: Upright,
-    waiting: int,
-    niceness: int = NICENESS,
+    queueing: Queueing,
 ) -> None:
-    """Segment images until the channel ends, the newest first; at most ``waiting`` wait."""
-    os.nice(niceness)
+    """Segment images until the channel ends."""
+    os.nice(queueing.niceness)
     segmenter = make_segmenter(options, sequence, find_weights, upright)
     channel.send(Ready(segmenter.labels.names))
     stack: list[ImageToSegment] = []
     while channel.open or stack:
         stack += channel.receive(0.0 if stack else 0.2)
-        for late in stack[:-waiting]:
+        for late in stack[: -queueing.most]:
             channel.send(NotSegmented(late.keyframe_id, "newer keyframes came first"))
-        stack = stack[-waiting:]
+        stack = stack[-queueing.most :]
         if stack:
-            image, started_s = stack.pop(), time.perf_counter()
+            image, started_s = stack.pop(-1 if queueing.newest_first else 0), time.perf_counter()
             try:
                 instances = segmenter.segment(image.rgb, image.name)
             except InputError as error:
@@ -69,7 +77,7 @@ class RemoteSegmenter:
         worker: the supervised process.
     """
 
-    niceness = NICENESS
+    queueing = Queueing()
 
     def __init__(
         self,
@@ -89,16 +97,14 @@ class RemoteSegmenter:
         self.dropped = 0
         self.segmentation_ms: list[float] = []
         self._requested: dict[int, ImageToSegment] = {}
-        self._most = MAX_WAITING if workstation is None else MAX_KEPT
-        known = upright or Upright()
-        arguments, name = (options, sequence, known, self._most), "segmenter"
+        queueing = self.queueing if workstation is None else Queueing(MAX_KEPT)
+        arguments, name = (options, sequence, upright or Upright(), queueing), "segmenter"
         self.worker: SupervisedWorker
         if workstation is not None:
             self.worker = DistantWorker(name, arguments, workstation)
         else:
             target = f"{__name__}:serve_segmenter"
-            here = (*arguments, self.niceness)
-            self.worker = SupervisedWorker(name, target, here, policy or RestartPolicy())
+            self.worker = SupervisedWorker(name, target, arguments, policy or RestartPolicy())
         try:
             self.labels = self._known_labels(options, sequence)
         except InputError:

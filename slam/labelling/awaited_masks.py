@@ -1,0 +1,70 @@
+"""Keyframes whose masks are to come.
+
+A network that works beside tracking takes longer than a frame. What it finds is used ``LAG`` frames
+after the keyframe and not earlier, however soon it comes: tracking goes on in the meantime, and a
+run that is repeated gives the same bytes, on one processor as on more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from bmask_slam.graph.arrays import Floats, Image
+from bmask_slam.semantics.segmenters.segmenter import EarlySegmenter, Segmenter
+from bmask_slam.sequences.frame import Frame
+
+LAG = 3
+"""Frames after which what another process answers is used: about as long as it needs."""
+DEPTH_STEP = 2
+"""Every second pixel of a keyframe's depth image is kept until its masks arrive."""
+
+
+@dataclass(frozen=True, eq=False)
+class AwaitingKeyframe:
+    """What the masks of a keyframe will need: its stamp and its thinned depth (h, w)."""
+
+    timestamp_s: float
+    depth_m: Floats
+
+
+def kept_depth(depth_m: Floats) -> Floats:
+    """Every DEPTH_STEP-th pixel each way of a z-depth image (H, W) in m."""
+    return depth_m[::DEPTH_STEP, ::DEPTH_STEP].copy()
+
+
+@dataclass(frozen=True, eq=False)
+class MaskRequest:
+    """Asks for the masks of a keyframe: its image (H, W, 3), and what that is called.
+
+    They are used when ``frames_left`` is 0.
+    """
+
+    keyframe_id: int
+    image: Image
+    name: str
+    frames_left: int
+
+
+class MaskRequests:
+    """The masks that were asked for and not used yet, oldest first."""
+
+    def __init__(self) -> None:
+        self._requests: list[MaskRequest] = []
+
+    def begin_frame(self) -> None:
+        """A frame begins; some may be due with it."""
+        self._requests = [replace(r, frames_left=r.frames_left - 1) for r in self._requests]
+
+    def add(self, keyframe_id: int, frame: Frame, segmenter: Segmenter) -> None:
+        """Ask for the masks of a frame that became a keyframe.
+
+        They are due at once, unless the segmenter can work beside its caller.
+        """
+        lag = LAG if isinstance(segmenter, EarlySegmenter) else 0
+        self._requests.append(MaskRequest(keyframe_id, frame.rgb, frame.name, lag))
+
+    def take(self, everything: bool = False) -> Iterator[MaskRequest]:
+        """Those that are due, or all, each once."""
+        while self._requests and (everything or self._requests[0].frames_left <= 0):
+            yield self._requests.pop(0)
