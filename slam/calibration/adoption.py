@@ -43,8 +43,8 @@ class SelfCalibrationConfig:
     """How much is tracked, and when something is adopted.
 
     Attributes:
-        frames: after which a run is looked at first; then after twice and four times as many, as
-            long as the motion does not show the parameters.
+        frames: after which a run is looked at first; then after twice as many, and again, as long
+            as the motion does not show the parameters.
         min_frames: fewer are not looked at, at the end of a sequence.
         stretches: how often it is looked at in vain at most.
         max_sigma_s: largest standard deviation of a time that counts as observable,
@@ -60,9 +60,9 @@ class SelfCalibrationConfig:
             the one adopted before takes its place.
     """
 
-    frames: int = 210
+    frames: int = 105
     min_frames: int = 90
-    stretches: int = 3
+    stretches: int = 4
     max_sigma_s: float = 0.004
     max_sigma_share: float = 0.1
     min_change_sigmas: float = 3.0

@@ -482,9 +482,9 @@ def test_no_readout_is_longer_than_a_frame() -> None:
 @pytest.mark.parametrize(
     ("looks", "frames", "last", "due"),
     [
-        (0, 210, False, True), (0, 209, False, False), (0, 100, True, True), (0, 89, True, False),
-        (1, 420, False, True), (1, 210, True, False), (1, 310, True, True), (2, 840, False, True),
-        (3, 1680, False, False), (3, 1200, True, False),
+        (0, 105, False, True), (0, 104, False, False), (0, 100, True, True), (0, 89, True, False),
+        (1, 210, False, True), (1, 190, True, False), (1, 200, True, True), (2, 420, False, True),
+        (3, 840, False, True), (4, 1680, False, False), (4, 1200, True, False),
     ],
 )  # fmt: skip
 def test_when_it_looks(looks: int, frames: int, last: bool, due: bool) -> None:

@@ -62,6 +62,17 @@ def test_an_image_that_was_begun_for_nothing_is_passed_over(beside, images) -> N
     )
 
 
+def test_several_images_may_be_begun_and_asked_for_in_any_order(beside, images) -> None:
+    for k in range(3):
+        beside.begin(images[k], f"image {k}")
+    here = make_segmenter(OPTIONS, Path())
+    for k in (2, 0, 1):
+        found, expected = beside.segment(images[k], f"image {k}"), here.segment(images[k], "")
+        np.testing.assert_array_equal(
+            surfaces_of(found).probabilities, surfaces_of(expected).probabilities
+        )
+
+
 def test_one_that_is_killed_is_started_again_and_finds_the_same(beside, images) -> None:
     expected = beside.segment(images[0], "a")
     beside.begin(images[0], "again")

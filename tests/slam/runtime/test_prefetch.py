@@ -1,4 +1,4 @@
-"""What a second thread prepares comes in order, and what nobody waits for is not prepared."""
+"""What other threads do comes in order, and what nobody waits for is not begun."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from bmask_slam.runtime.prefetch import AHEAD, prepared_ahead
+from bmask_slam.runtime.prefetch import AHEAD, THREADS, in_threads, prepared_ahead
 
 
 def test_results_come_in_order_from_a_second_thread() -> None:
@@ -33,3 +33,19 @@ def test_who_stops_early_waits_for_no_more_than_what_was_begun() -> None:
     next(results)
     results.close()
     assert 1 <= len(prepared) <= AHEAD + 2
+
+
+def test_several_threads_work_at_the_same_time_and_results_keep_their_order() -> None:
+    meeting = threading.Barrier(THREADS, timeout=20)
+
+    def square(number: int) -> int:
+        meeting.wait()  # passes only where as many threads work at the same time
+        return number**2
+
+    numbers = range(6 * THREADS)
+    assert in_threads(square, numbers) == [k**2 for k in numbers]
+
+
+def test_an_exception_in_one_of_several_threads_is_raised() -> None:
+    with pytest.raises(ZeroDivisionError):
+        in_threads(lambda number: 1 / number, [2, 1, 0, 4])

@@ -1,5 +1,6 @@
 """Sequences in TUM layout: frames, their order, and the reading thread."""
 
+import dataclasses
 import re
 import threading
 import time
@@ -12,6 +13,7 @@ from repository import KITCHEN
 from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences.info import format_info, sequence_info
 from bmask_slam.sequences.prefetch import prefetched
+from bmask_slam.sequences.recording import Recording
 from bmask_slam.sequences.sequence import open_sequence
 
 
@@ -142,6 +144,25 @@ def test_groundtruth(folder):
     (folder / "groundtruth.txt").write_text("0.1 1 2 3\n")
     with pytest.raises(InputError, match=r"groundtruth\.txt:1"):
         open_sequence(folder)
+
+
+def test_another_delay_pairs_anew_and_decodes_nothing_twice(folder, monkeypatch):
+    sequence = open_sequence(folder)
+    delayed = sequence.with_delay(0.1)
+    again = sequence.with_camera(dataclasses.replace(sequence.camera, depth_time_offset_s=0.1))
+    assert delayed.camera == again.camera
+    assert delayed.pairs.depth_files == again.pairs.depth_files != sequence.pairs.depth_files
+    decoded = []
+    read = Recording.read_depth
+    monkeypatch.setattr(
+        Recording, "read_depth", lambda *about: decoded.append(about[1]) or read(*about)
+    )
+    file = delayed.pairs.depth_files[3]
+    first = sequence.pairs.depth_files.index(file)
+    np.testing.assert_array_equal(sequence.depth(first)[0], again.depth(3)[0])
+    decoded.clear()
+    np.testing.assert_array_equal(delayed.depth(3)[0], again.depth(3)[0])
+    assert file not in decoded
 
 
 def test_info(folder):
