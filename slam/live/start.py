@@ -92,13 +92,19 @@ class LiveOptions:
 def start_calibration(
     camera: Camera, config: SystemConfig, options: LiveOptions
 ) -> RemoteCalibration:
-    """The process that estimates the camera."""
+    """The process that estimates the camera.
+
+    Frames are not tracked again. So a camera that says nothing of its readout time, which bends the
+    map most, is looked at early; one that does, where more frames show the rest.
+    """
     free: list[int] = [SHUTTER]
     if options.interpolates:
         free.append(TIME)
     if options.straightens:
         free.extend(BENDS)
     rules = SelfCalibrationConfig()
+    if camera.rolling_shutter_s:
+        rules = replace(rules, frames=2 * rules.frames, stretches=rules.stretches - 1)
     follows = tuple(free), options.pairs
     setup = CalibrationSetup(camera, config.graph, rules, options.calibrate, *follows)
     return RemoteCalibration(setup)

@@ -114,11 +114,14 @@ class CalibrationServer:
             self._edges.pop(oldest, None)
 
     def estimate(self, message: EstimateCamera) -> CameraEstimated:
-        """What the keyframes say of the camera."""
-        setup, config = self._setup, self._setup.config
+        """What the keyframes say of the camera.
+
+        Those of a camera without a readout time are asked once more after one is adopted.
+        """
+        setup, config, before = self._setup, self._setup.config, self._state
         run, world, paths = read_state(message.state, setup.graph)
         kept = {k: depth for k, depth in self._depths.items() if k in world.keyframes}
-        state = replace(self._state, looks=self._state.looks + 1)
+        state = replace(before, looks=before.looks + 1)
         try:
             reader = KeptDepths(kept, run.camera)
             estimate = estimate_again(world, run, reader, setup.camera, config.min_change_s)
@@ -127,12 +130,13 @@ class CalibrationServer:
             estimate = None
         if estimate is not None:
             logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
-            state = judged(self._state, estimate, setup.mode, config, setup.free)
+            state = judged(before, estimate, setup.mode, config, setup.free)
         late = None if TIME in adopted_parameters(state) else self._by_edges(run, world)
         self._state = state = late or state
         if state.adopted and state.camera != run.camera:
             motions = self._motions(world, paths, run, state.camera)
-            return CameraEstimated(state.camera, motions, state.text, late is None)
+            done = before.adopted or (late is None and setup.camera.rolling_shutter_s != 0)
+            return CameraEstimated(state.camera, motions, state.text, done)
         done = state.adopted or state.settled or state.looks >= config.stretches
         return CameraEstimated(None, {}, state.text, done)
 
