@@ -85,6 +85,7 @@ def all_stay(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def converged(all_stay: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(joint_adjustment, "MAX_STEPS", (30, 30))
+    monkeypatch.setattr(joint_adjustment, "LEAST_DECREASE", 1e-12)
     monkeypatch.setattr(joint_adjustment, "CG_STEPS", 1000)
     monkeypatch.setattr(joint_adjustment, "CG_TOLERANCE", 1e-10)
 

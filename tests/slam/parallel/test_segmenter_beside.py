@@ -26,7 +26,7 @@ OPTIONS = SegmenterOptions("light")
 
 @pytest.fixture(scope="module")
 def beside() -> Iterator[SegmenterBeside]:
-    segmenter = SegmenterBeside(OPTIONS, Path())
+    segmenter = SegmenterBeside(OPTIONS, Path(), Upright("top"))  # else by the images before
     yield segmenter
     segmenter.close()
 
