@@ -244,7 +244,7 @@ class SemanticMapper:
 
     def begin_session(self) -> None:
         """Another recording begins: masks of earlier keyframes are not awaited."""
-        self._waiting = {}
+        self._waiting, self._requests = {}, MaskRequests()
 
     def _begin(self, names: LabelSet, measured: str) -> None:
         """Begin with empty stores; ``measured`` names what is known of the masks' errors."""
