@@ -184,7 +184,7 @@ class LabelStore:
         misses, recall = self._misses[ids], None
         if self.model is not None:
             misses, recall = misses[:, self.model.groups[1:]], self.model.best_recall[1:]
-        found, rows = np.zeros(misses.shape), misses.any(axis=1)  # few have any
+        found, rows = np.zeros(misses.shape), misses.any(axis=1)  # the others have 0
         found[rows] = self.config.log_missed(misses[rows], recall)
         return found
 
