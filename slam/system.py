@@ -9,6 +9,7 @@ from bmask_slam.back_end.frame_adjustment import adjust_with_frames
 from bmask_slam.back_end.map_backend import MapBackend
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.back_end.marker_loops import join_by_markers
+from bmask_slam.back_end.reinterpretation import beginning
 from bmask_slam.back_end.segment_joining import can_join
 from bmask_slam.features.brisk import BriskExtractor, Features
 from bmask_slam.features.marker_detection import MarkerDetector
@@ -177,7 +178,7 @@ class SlamSystem(SavedSystem):
 
     @stage("tracking")
     def _track(self, static: StaticFeatures) -> Tracked:
-        return self._reported(self.camera_tracker.track(static.features))
+        return self._after_beginning(self._reported(self.camera_tracker.track(static.features)))
 
     def _reported(self, tracked: Tracked) -> Tracked:
         """A tracked frame, once it is reported that it is lost, found again or begins a segment."""
@@ -188,6 +189,20 @@ class SlamSystem(SavedSystem):
         else:
             self.events.tracked(len(tracked.landmark_ids))
         return tracked
+
+    def _after_beginning(self, tracked: Tracked) -> Tracked:
+        """A frame; if it is the second of a segment, after it has told how the first one moved."""
+        tracker, world, first = self.camera_tracker, self.map.world, self.camera_tracker.reference
+        if first is None or self.keyframes.frames_since or not tracked.status.by_image:
+            return tracked
+        previous = tracker.motion.previous(tracker.lost_frames)
+        if previous is None or world.in_segment(first.segment) != [first]:
+            return tracked
+        found = beginning(world, first, previous, tracked, self.camera)
+        if found is None:
+            return tracked
+        self._map_uses_camera(self.camera, {first.id: found.motion})
+        return found.second
 
     @stage("moving")
     def _learn_motion(self, frame: Frame, tracked: Tracked, static: StaticFeatures) -> bool:

@@ -11,17 +11,30 @@ import numpy as np
 from bmask_slam.back_end.factor_selection import read_back
 from bmask_slam.back_end.factors import sent_observations
 from bmask_slam.back_end.mapper import Mapper
-from bmask_slam.features.brisk import Features
+from bmask_slam.features.brisk import Features, select
 from bmask_slam.graph.arrays import Array, Ints, no_ids
 from bmask_slam.graph.camera import Camera
-from bmask_slam.tracking.rolling_shutter import Motion, after_mean_row_s, at_one_moment, velocities
+from bmask_slam.graph.geometry import inverse, se3_log, transform
+from bmask_slam.tracking.pose_optimisation import optimise_pose
+from bmask_slam.tracking.results import Tracked
+from bmask_slam.tracking.rolling_shutter import (
+    Motion,
+    PreviousPose,
+    after_mean_row_s,
+    at_one_moment,
+    motion_since,
+    velocities,
+)
 from bmask_slam.world.frame_observations import FrameObservations
 from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 
 MAX_CHANGE = 0.1
 """A larger relative change of the depth by the delay is an error."""
+BEGINNING_ROUNDS = 4
+"""Each leaves about a third of the error of the motion."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,25 +45,93 @@ class KeyframeMotion:
         twist: (6,) of the camera in its own frame [rad/s, m/s].
         keypoints: (N,) whose depth changes.
         inverse_depth_change: (N,) 1/m, to be added.
+        was: (6,) the twist that the observations were made by; None: the same.
     """
 
     twist: Array
     keypoints: Ints = field(default_factory=no_ids)
     inverse_depth_change: Array = field(default_factory=lambda: np.zeros(0))
+    was: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Beginning:
+    """What the second frame of a segment tells about the keyframe that began it.
+
+    Attributes:
+        motion: of the keyframe, which was made as of a camera at rest.
+        second: the second frame, tracked by the keyframe as it is in that motion.
+    """
+
+    motion: KeyframeMotion
+    second: Tracked
+
+
+def beginning(
+    world: WorldMap,
+    keyframe: Keyframe,
+    previous: PreviousPose,
+    tracked: Tracked,
+    camera: Camera,
+) -> Beginning | None:
+    """One motion for the keyframe that began a segment and the frame that was tracked after it.
+
+    Nothing was known of the keyframe's motion, so that a rolling shutter has bent its landmarks,
+    and with them the pose of the frame after it. Both are interpreted anew by the motion between
+    them until that changes no more. None where it is not known, and with a global shutter.
+    """
+    found = motion_since(previous, tracked.T_world_camera, camera)
+    if found is None:
+        return None
+    points = world.landmarks.points_world[tracked.landmark_ids]
+    points = transform(inverse(keyframe.T_world_camera), points)  # which only the keyframe has seen
+    mean_s = camera.exposed_after_s(keyframe.features.image_pixels[:, 1]).mean()
+    later_s = camera.exposed_after_s(camera.project_distorted(points)[:, 1]) - mean_s
+    T, taken = tracked.T_world_camera, found.twist
+    for _ in range(BEGINNING_ROUNDS):
+        twist = se3_log(inverse(previous.T_world_camera) @ T) / previous.ago_s
+        still = points - later_s[:, None] * velocities(points, twist)
+        second = reinterpreted(tracked.features, KeyframeMotion(twist, was=taken), camera, camera)
+        matched = select(second, tracked.keypoints)
+        estimate = optimise_pose(
+            T,
+            transform(keyframe.T_world_camera, still),
+            matched.measurements,
+            matched.sigmas_px,
+            camera,
+        )
+        if not estimate.ok:
+            return None
+        T = estimate.T_world_camera
+    motion = KeyframeMotion(twist, was=np.zeros(6))
+    return Beginning(motion, replace(tracked, T_world_camera=T, features=second))
 
 
 def use_camera(mapper: Mapper, camera: Camera, motions: Mapping[int, KeyframeMotion]) -> None:
     """Let a map go on with another camera; keyframes of known motion follow it."""
     keyframes = mapper.world.keyframes
-    for number in sorted(motions.keys() & keyframes.keys()):
-        reinterpret(keyframes[number], motions[number], mapper.camera, camera)
-        mapper.world.store_features(keyframes[number])
+    known = [keyframes[number] for number in sorted(motions.keys() & keyframes.keys())]
+    for keyframe in known:
+        reinterpret(keyframe, motions[keyframe.id], mapper.camera, camera)
+        mapper.world.store_features(keyframe)
     mapper.camera = camera
     observations = sent_observations(mapper.world, camera.graph_depth_factor)
     estimate = mapper.smoother.remeasure(camera, observations)
     for note in estimate.notes():
         logger.info("graph: %s", note)
     read_back(mapper.world, estimate)
+    for keyframe in known:
+        place_landmarks(mapper.world, keyframe, camera)
+
+
+def place_landmarks(world: WorldMap, keyframe: Keyframe, camera: Camera) -> None:
+    """Put the landmarks that only this keyframe has seen where its features have them now."""
+    rows, ids = world.observed(keyframe)
+    landmarks, features = world.landmarks, keyframe.features
+    alone = (landmarks.observations[ids] == 1) & ~landmarks.in_graph[ids]
+    alone &= np.isfinite(features.depth_m[rows])
+    points = camera.backproject(features.pixels[rows[alone]], features.depth_m[rows[alone]])
+    landmarks.points_world[ids[alone]] = transform(keyframe.T_world_camera, points)
 
 
 def reinterpret_frames(
@@ -80,7 +161,8 @@ def reinterpreted(features: Features, motion: KeyframeMotion, old: Camera, new: 
     in the image again.
     """
     known = Motion(motion.twist, 0.0)
-    depth_m = _as_exposed_m(features, motion.twist, old)
+    was = motion.twist if motion.was is None else motion.was
+    depth_m = _as_exposed_m(features, was, old)
     pixels = features.image_pixels
     depth_m /= 1 + depth_m * (old.depth_bend(pixels) - new.depth_bend(pixels))
     rows, change = motion.keypoints, motion.inverse_depth_change

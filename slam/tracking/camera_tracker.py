@@ -26,6 +26,8 @@ class CameraTracker:
         lost_frames: frames since the last pose; 0 while tracking.
         reference: the keyframe that poses are stored relative to; None where no map has been begun.
         segment: the map segment that is tracked in.
+        motion: the last pose, and how the camera moved.
+        local_ids: (N,) landmarks of the local map that the next frame will be tracked against.
     """
 
     def __init__(
@@ -42,37 +44,32 @@ class CameraTracker:
         self.segment = 0
         self._map = map_reader
         self._relocalisation, self._local_map = relocalisation, local_map
-        self._motion = MotionModel()
+        self.motion = MotionModel()
         self._recent_ids: Ints = np.zeros(0, np.int64)
-        self._local_ids: Ints = np.zeros(0, np.int64)
+        self.local_ids: Ints = np.zeros(0, np.int64)
         self._images = GuidedLandmarks(extractor, tracker.config.image_motion)
 
     def state(self) -> Arrays:
         """The motion, and the landmarks that the next frame will be tracked against."""
         return {
             "lost_frames": np.array(self.lost_frames),
-            **self._motion.state(),
+            **self.motion.state(),
             "recent_ids": self._recent_ids,
-            "local_ids": self._local_ids,
+            "local_ids": self.local_ids,
             **nested(images=self._images.state()),
         }
 
     def restore(self, state: Arrays) -> None:
         """Become the tracker of a state; its reference and segment are restored by the system."""
         self.lost_frames = int(state["lost_frames"])
-        self._motion.restore(state)
-        self._recent_ids, self._local_ids = state["recent_ids"], state["local_ids"]
+        self.motion.restore(state)
+        self._recent_ids, self.local_ids = state["recent_ids"], state["local_ids"]
         self._images.restore(part(state, "images"))
 
     @property
     def timestamp_s(self) -> float:
         """Time of the last frame that was begun; NaN before the first."""
-        return self._motion.now_s
-
-    @property
-    def local_ids(self) -> Ints:
-        """Landmarks of the local map that the next frame will be tracked against."""
-        return self._local_ids
+        return self.motion.now_s
 
     def begin_session(self) -> None:
         """A new recording in a known map: the first frame is searched in the largest segment.
@@ -82,23 +79,23 @@ class CameraTracker:
         world = self._map.world
         self.segment = world.largest_segment()
         self.reference = world.in_segment(self.segment)[-1]
-        self._motion.last_s = self._motion.now_s = np.nan
+        self.motion.last_s = self.motion.now_s = np.nan
         self.reset(self._relocalisation.patience_frames)
 
     def reset(self, lost_frames: int) -> None:
         """Lost for so many frames, with no knowledge of where the camera is."""
         self.lost_frames = lost_frames
-        self._recent_ids = self._local_ids = np.zeros(0, np.int64)
+        self._recent_ids = self.local_ids = np.zeros(0, np.int64)
         self._images.forget()
         self.restart(np.eye(4))
 
     def restart(self, T_world_camera: Array) -> None:
         """Begin at a pose, without speed: a new segment, or a map that was moved."""
-        self._motion.restart(T_world_camera)
+        self.motion.restart(T_world_camera)
 
     def begin_frame(self, timestamp_s: float) -> None:
         """Set the time of the frame that is tracked next; else the last interval is repeated."""
-        self._motion.now_s = timestamp_s
+        self.motion.now_s = timestamp_s
         self._images.end_frame()
 
     def look(self, frame: Frame, features: Features) -> None:
@@ -119,7 +116,7 @@ class CameraTracker:
 
     def preview(self, features: Features) -> Array | None:
         """The pose that ``track`` would find, None if it would find none; no state is changed."""
-        tracked = self._tracked(features, self._map.world.landmarks.remaining(self._local_ids))
+        tracked = self._tracked(features, self._map.world.landmarks.remaining(self.local_ids))
         return None if tracked.status is TrackingStatus.LOST else tracked.T_world_camera
 
     def can_begin(self, features: Features) -> bool:
@@ -136,7 +133,7 @@ class CameraTracker:
     def exclude_landmarks(self, landmark_ids: Ints) -> None:
         """Do not track against these landmarks (N,)."""
         if len(landmark_ids):
-            self._local_ids = np.setdiff1d(self._local_ids, landmark_ids)
+            self.local_ids = np.setdiff1d(self.local_ids, landmark_ids)
             self._recent_ids = self._recent_ids[~np.isin(self._recent_ids, landmark_ids)]
 
     def track(self, features: Features) -> Tracked:
@@ -172,15 +169,15 @@ class CameraTracker:
         if self.reference is None:
             raise ValueError("no map has been begun")
         world = self._map.world
-        self._local_ids = world.landmarks.remaining(self._local_ids)
+        self.local_ids = world.landmarks.remaining(self.local_ids)
         tracked = self._tracked_in_image(features)
         if tracked.status is TrackingStatus.LOST:
             tracked = self._found_again(features, everywhere) or tracked
         if tracked.status is TrackingStatus.LOST:
             self.lost_frames += 1
             self._images.end_frame()
-            self._motion.stop()
-            moved = self._motion.by_odometry(self._map.sensors)
+            self.motion.stop()
+            moved = self.motion.by_odometry(self._map.sensors)
             return tracked if moved is None else reckoned(tracked, *moved)
         world.landmarks.visible[tracked.visible_ids] += 1
         world.landmarks.found[tracked.landmark_ids] += 1
@@ -199,7 +196,7 @@ class CameraTracker:
             self.segment = nearest.segment
             return tracked
         way, rules = (nearest, self.reference), self._relocalisation
-        near = is_within_reach(self._motion, tracked.T_world_camera, world, way, rules)
+        near = is_within_reach(self.motion, tracked.T_world_camera, world, way, rules)
         return tracked if near else None
 
     def recognise(self, features: Features, keyframes: list[Keyframe]) -> Tracked | None:
@@ -215,7 +212,7 @@ class CameraTracker:
         T_world_tracked is the pose as tracked, T_world_camera as optimised; the landmarks (N,) are
         those that the frame observes.
         """
-        self._motion.advance(T_world_tracked, T_world_camera, steady=self.lost_frames == 0)
+        self.motion.advance(T_world_tracked, T_world_camera, steady=self.lost_frames == 0)
         self._recent_ids = landmark_ids
         self.lost_frames = 0
 
@@ -234,7 +231,7 @@ class CameraTracker:
         The last pose moves with it, and fused landmarks are replaced; a new owner may have fewer.
         """
         landmarks = self._map.world.landmarks
-        self._motion.follow_map(T_old, T_new)
+        self.motion.follow_map(T_old, T_new)
         known = self._recent_ids[self._recent_ids < len(landmarks)]
         self._recent_ids = landmarks.remaining(landmarks.current(known))
         self._images.follow_map(landmarks)
@@ -244,20 +241,20 @@ class CameraTracker:
         world = self._map.world
         self.reference = keyframe
         _, observed = world.observed(keyframe)
-        self._local_ids = local_landmarks(world, observed, self._local_map)
+        self.local_ids = local_landmarks(world, observed, self._local_map)
 
     def _tracked(self, features: Features, local_ids: Ints) -> Tracked:
-        T, world, last = self._predicted(), self._map.world, self._motion.previous(self.lost_frames)
+        T, world, last = self._predicted(), self._map.world, self.motion.previous(self.lost_frames)
         return self.tracker.track(features, T, self._recent_ids, local_ids, world, last)
 
     def _follow(self, features: Features) -> None:
         """Follow the last frame's corners into this one."""
-        T_last_next = inverse(self._motion.T_world_last) @ self._unseen()
-        self._images.follow(features, T_last_next, self._motion.ago_s)
+        T_last_next = inverse(self.motion.T_world_last) @ self._unseen()
+        self._images.follow(features, T_last_next, self.motion.ago_s)
 
     def _tracked_in_image(self, features: Features) -> Tracked:
         """The pose by the local map; where that ends, by the landmarks ahead of the map as well."""
-        known, enough = self._local_ids, self.tracker.config.min_inliers
+        known, enough = self.local_ids, self.tracker.config.min_inliers
         tracked = self._by_landmarks(features, known)
         if tracked.firm >= enough or not len(ahead := self._map.landmarks_ahead):
             return tracked
@@ -282,7 +279,7 @@ class CameraTracker:
 
     def _guided(self, features: Features, ids: Ints) -> Tracked:
         """The pose by landmarks (N,), some of which were followed from the last image."""
-        T, world, last = self._predicted(), self._map.world, self._motion.previous(self.lost_frames)
+        T, world, last = self._predicted(), self._map.world, self.motion.previous(self.lost_frames)
         guided = self._images.guided(features, ids, world.landmarks)
         return self.tracker.refine(features, T, ids, world, last, guided)
 
@@ -291,9 +288,9 @@ class CameraTracker:
         followed = self._images.followed
         if followed is None:
             return self._unseen()
-        return orthonormalised(self._motion.T_world_last @ followed.estimate.T_world_camera)
+        return orthonormalised(self.motion.T_world_last @ followed.estimate.T_world_camera)
 
     def _unseen(self) -> Array:
         """T_world_camera (4, 4) by the last motion; in a blackout by odometry if that knows it."""
-        moved = self._motion.by_odometry(self._map.sensors) if self.lost_frames else None
-        return self._motion.by_velocity() if moved is None else moved[0]
+        moved = self.motion.by_odometry(self._map.sensors) if self.lost_frames else None
+        return self.motion.by_velocity() if moved is None else moved[0]

@@ -6,7 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_view import CAMERA, make_features, points_before, random_descriptors
+from synthetic_view import (
+    CAMERA,
+    make_features,
+    points_before,
+    random_descriptors,
+    render_plane,
+)
 
 from bmask_slam.back_end.reinterpretation import (
     KeyframeMotion,
@@ -14,7 +20,8 @@ from bmask_slam.back_end.reinterpretation import (
     reinterpret_frames,
 )
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.geometry import inverse, se3_exp, transform
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
+from bmask_slam.system import SlamSystem
 from bmask_slam.world.frame_observations import FrameObservations, FrameView
 from bmask_slam.world.keyframe import Keyframe
 
@@ -115,3 +122,30 @@ def test_frames_are_interpreted_anew_like_keyframes_and_dropped_if_their_motion_
     for name in ("pixels", "depth_m", "disparity_px"):
         expected = getattr(keyframe.features, name)
         np.testing.assert_allclose(getattr(seen, name), expected, rtol=1e-5, err_msg=name)
+
+
+def test_the_keyframe_that_begins_a_map_in_motion_is_not_bent() -> None:
+    """Rendered row by row; the second frame tells how the camera moved during the first."""
+    twist = np.array([0.3, -1.2, 0.2, 0.1, 0.1, 0.0])
+    rows_s = READOUT_S * CAMERA.share_of_rows(np.arange(480.0))
+    frames = [render_plane(se3_exp((k / 30 + rows_s)[:, None] * twist), k) for k in range(3)]
+    system = SlamSystem(ROLLING)
+
+    def unevenness_m() -> float:
+        """Of the plane's landmarks; the map's frame is that of the mean row, wherever that is."""
+        landmarks = system.map.world.landmarks
+        points = landmarks.points_world[landmarks.in_map]
+        return float(np.linalg.svd(points - points.mean(0))[1][2] / len(points) ** 0.5)
+
+    system.process(frames[0])
+    assert unevenness_m() > 0.005
+    second = system.process(frames[1]).T_world_camera
+    assert unevenness_m() < 0.001
+    T = se3_exp(twist / 30)  # in the frame of the first
+    assert second is not None
+    turned, moved = np.split(np.abs(se3_log(inverse(np.asarray(T)) @ second)), 2)
+    assert turned.max() < 0.001 and moved.max() < 0.002
+    observed, sent = system.map.world.keyframes[0].features, system.frame_observations.views
+    system.process(frames[2])
+    assert system.map.world.keyframes[0].features is observed  # once
+    assert len(sent) == 2
