@@ -22,10 +22,11 @@ EDGES = [(a, b) for a, b in combinations(range(8), 2) if np.abs(CORNERS[a] - COR
 AT_ONCE = 1000
 MIN_WITNESSES, MAX_FREE_SHARE = 1.0, 0.5
 """A surface needs so many frames that saw it, and at most this share of them saw through it."""
-MAX_STEP_VOXELS = 6.0
-"""Distances in a cell differ by less: else it is not a surface that a frame saw, but the limit
-between what is behind one and what another frame saw as free beside it."""
-MIN_COMPONENT_M2 = 0.02
+MAX_STEP_VOXELS, MAX_CORNER_VOXELS = 8.0, 0.55
+"""Distances in a cell differ by less, and a corner is as near: a plane through a cube passes within
+half an edge of a corner, and noise adds a little. Else it is not a surface that a frame saw, but
+the limit between what is behind one and what another frame saw as free beside it."""
+MIN_COMPONENT_M2 = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,11 +215,13 @@ def _vertices(cells: _Cells, voxel_m: float) -> tuple[NDArray, ...]:
     A vertex is the mean of the points where the edges of its cell are crossed.
     """
     window = [cells.distance[:, i : i + EDGE, j : j + EDGE, k : k + EDGE] for i, j, k in CORNERS]
-    low, high = window[0].copy(), window[0].copy()
+    low, high, nearest = window[0].copy(), window[0].copy(), np.abs(window[0])
     for value in window[1:]:
         np.minimum(low, value, out=low)  # NaN stays NaN
         np.maximum(high, value, out=high)
+        np.minimum(nearest, np.abs(value), out=nearest)
     crossed = (low < 0) & (high >= 0) & (high - low < MAX_STEP_VOXELS * voxel_m)
+    crossed &= nearest <= MAX_CORNER_VOXELS * voxel_m
     block, *local = np.nonzero(crossed)
     at = [(block, *(a + c for a, c in zip(local, corner, strict=True))) for corner in CORNERS]
     d: Array = np.stack([cells.distance[a] for a in at], axis=1).astype(float)

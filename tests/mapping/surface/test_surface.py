@@ -54,6 +54,19 @@ def test_a_plane_is_found_with_its_normals_facing_the_cameras() -> None:
     assert found.views.max() == len(POSES)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.25, 0.49, 0.5, 0.51])
+def test_a_plane_is_whole_wherever_it_lies_between_voxels(share: float) -> None:
+    rng, z_m = np.random.default_rng(0), OFFSET_M + share * VOXEL_M
+
+    def columns(noise: Array) -> int:
+        """Of voxels along z in which the surface is."""
+        found = surface_of([frame(1 / (z_m + n), np.eye(4)) for n in noise]).vertices
+        return len(np.unique(np.floor(found[:, :2] / VOXEL_M), axis=0))
+
+    exact, noisy = columns(np.zeros((1, 30, 40))), columns(rng.normal(0, 0.001, (9, 30, 40)))
+    assert noisy > 0.99 * exact > 1000  # noise moves some beyond the image's edge
+
+
 def test_weights_are_the_sum_of_the_inverse_variances() -> None:
     """sigma_d = sigma_z cos(angle), sigma_z = sigma_rho z^2, and 10 mm; in 1/cm^2."""
     T = np.eye(4)
@@ -149,16 +162,17 @@ def test_what_keyframes_did_not_see_needs_more_witnesses() -> None:
     assert seen(12) > 300
 
 
-def test_the_limit_between_behind_and_free_is_no_surface() -> None:
+@pytest.mark.parametrize("voxels", [3, 8])
+def test_the_limit_between_behind_and_free_is_no_surface(voxels: int) -> None:
     """As where other frames look past the rim of a plate: what is at the rim, none has seen."""
     volume = SurfaceVolume(VOXEL_M, CAMERA)
     volume.integrate(frame(np.full((30, 40), 0.5), np.eye(4)))
     bricks = (volume._origin[: len(volume), None] + volume._bricks).reshape(-1, 1, 3)
     beside = (bricks + volume._voxels)[..., 0] > 0.01
-    volume.distance[: len(beside)][beside] = 8 * VOXEL_M
+    volume.distance[: len(beside)][beside] = voxels * VOXEL_M
     found = extract(volume).vertices
     assert len(found) > 100
-    assert np.abs(found[:, 2] - 2.0).max() < 0.5 * VOXEL_M
+    assert np.abs(found[:, 2] - 2.0).max() < 0.501 * VOXEL_M
 
 
 def test_rims_count_little_and_what_flies_beside_them_not_at_all() -> None:
