@@ -26,7 +26,11 @@ MAX_STEP_VOXELS, MAX_CORNER_VOXELS = 8.0, 0.55
 """Distances in a cell differ by less, and a corner is as near: a plane through a cube passes within
 half an edge of a corner, and noise adds a little. Else it is not a surface that a frame saw, but
 the limit between what is behind one and what another frame saw as free beside it."""
-MIN_COMPONENT_M2 = 0.005
+SMOOTHING, SAME_SIDE_COSINE = 3, np.float32(np.cos(np.radians(30.0)))
+"""Normals of neighbours are averaged so often, but not across an edge of more than 30 degrees."""
+MIN_COMPONENT_M2, MIN_JUDGE_M2 = 0.005, 0.02
+"""Smaller pieces are left out of a surface, and of that by which frames are judged: there is less
+of it, so that a person's hand is a piece."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,14 +111,14 @@ def extract_blocks(
     return found.select(_used(found))
 
 
-def without_crumbs(surface: Surface, voxel_m: float) -> Surface:
-    """The surface without components smaller than MIN_COMPONENT_M2."""
+def without_crumbs(surface: Surface, voxel_m: float, least_m2: float = MIN_COMPONENT_M2) -> Surface:
+    """The surface without components smaller than ``least_m2``."""
     count, (a, b, c) = len(surface.vertices), surface.triangles.T
     ends = np.concatenate([a, b]), np.concatenate([b, c])
     joined = coo_matrix((np.ones(len(ends[0]), np.int8), ends), (count, count))
     component = connected_components(joined, directed=False)[1]
     size = np.bincount(component[a], minlength=int(component.max(initial=0)) + 1)
-    kept = surface.select(size[component] * 0.5 * voxel_m**2 >= MIN_COMPONENT_M2)
+    kept = surface.select(size[component] * 0.5 * voxel_m**2 >= least_m2)
     return kept.select(_used(kept))
 
 
@@ -259,13 +263,21 @@ def _mean_crossing(d: Array) -> Array:
 
 
 def _normals(vertices: Floats, triangles: Ints) -> Floats:
-    """Unit normals (N, 3): means of the triangles' around a vertex, weighted by their areas."""
+    """Unit normals (N, 3): means of the triangles' around a vertex, weighted by their areas, then
+    SMOOTHING times means with those of its neighbours that are on the same side of an edge."""
     a, b, c = (vertices[triangles[:, k]].astype(float) for k in range(3))
     areas, corners = np.tile(np.cross(b - a, c - a), (3, 1)), triangles.T.reshape(-1)
-    total = [np.bincount(corners, area, len(vertices)) for area in areas.T]
-    found = np.stack(total, axis=1).astype(float)
-    found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12)
-    return np.asarray(found, np.float32)
+    found = np.stack([np.bincount(corners, area, len(vertices)) for area in areas.T], axis=1)
+    length = np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12)
+    normals: Floats = (found / length).astype(np.float32)
+    ends = corners, triangles[:, (1, 2, 0)].T.reshape(-1)
+    for _ in range(SMOOTHING):
+        cosines = np.einsum("ij,ij->i", normals[ends[0]], normals[ends[1]])
+        weights = np.maximum(cosines - SAME_SIDE_COSINE, 0) / (1 - SAME_SIDE_COSINE)
+        beside = coo_matrix((weights, ends), (len(vertices),) * 2).tocsr()
+        normals = normals + beside @ normals + beside.T @ normals
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return normals
 
 
 def _triangles(keys: Ints, crossings: NDArray[np.int8]) -> Ints:

@@ -25,6 +25,7 @@ from bmask_slam.mapping.inverse_depth.regularisation import regularise
 from bmask_slam.mapping.products.surface_labels import dilate
 from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame, mark_unexplained
 from bmask_slam.mapping.surface.extraction import (
+    MIN_JUDGE_M2,
     MIN_WITNESSES,
     Surface,
     extract,
@@ -117,7 +118,7 @@ class _SurfaceMaker:
         for number in self._keyframes:
             alone.add(number, self._keyframe(number, poses[number]))
         if frames:
-            seen = without_crumbs(extract(alone.volume, 1), voxel_m)
+            seen = without_crumbs(extract(alone.volume, 1), voxel_m, MIN_JUDGE_M2)
             self._gate = judge_of(seen.vertices, self._views(), self._fused.run.camera)
         gone = [n for n in surface if n not in poses]
         read = surface.follow(poses, gone, lambda done: progress(done, len(poses)))
