@@ -38,7 +38,6 @@ NEWER_ARRAYS = (
     "mapper.events.",
     "mapper.history.information",
     "mapper.loops.noise.",
-    "mapper.world.landmarks.spare",
     "mapper.loops.drift.",
     "mapper.loops.recogniser.dismissed",
     "localiser.images.",
@@ -47,7 +46,7 @@ NEWER_ARRAYS = (
 )
 """Beginnings of the names of arrays that older files lack; an empty system's are used then."""
 OPTIONAL_ARRAYS = (
-    *("s.measured", "upright.points", "upright.sides"),
+    *("landmarks.spare", "s.measured", "upright.points", "upright.sides"),
     *("labels.scores", "labels.seen", "labels.judged"),
     *("votes.coded", "votes.cell_px", "votes.codes_shape", "votes.codes", "points.covered"),
 )

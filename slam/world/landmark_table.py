@@ -249,12 +249,12 @@ class LandmarkTable:
 
     def restore(self, state: Arrays) -> None:
         """Become the table of a state; this table must be new. Raises ValueError."""
-        check_ids(np.concatenate([state["ids"], state["spare"]]), int(state["size"]))
+        self.spare = state.get("spare", self.spare)  # of older files there is none
+        check_ids(np.concatenate([state["ids"], self.spare]), int(state["size"]))
         if (state["replaced_by"] >= 0).any():
             raise ValueError("a landmark of the map that was fused into another")
         self.extend_to(int(state["size"]))
         self._assign_rows(state["ids"])
-        self.spare = state["spare"]
         for name in _COLUMNS:
             getattr(self, name)[state["ids"]] = True if name == "in_map" else state[name]
 
