@@ -29,8 +29,8 @@ the limit between what is behind one and what another frame saw as free beside i
 SMOOTHING, SAME_SIDE_COSINE = 3, np.float32(np.cos(np.radians(30.0)))
 """Normals of neighbours are averaged so often, but not across an edge of more than 30 degrees."""
 MIN_COMPONENT_M2, MIN_JUDGE_M2 = 0.005, 0.02
-"""Smaller pieces are left out of a surface, and of that by which frames are judged: there is less
-of it, so that a person's hand is a piece."""
+"""Smaller pieces are left out of a surface, and of that of the keyframes alone, by which frames are
+judged: what one of them saw of a person, such as a hand, is no surface there."""
 
 
 @dataclass(frozen=True, eq=False)
