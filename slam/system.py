@@ -193,10 +193,11 @@ class SlamSystem(SavedSystem):
     def _after_beginning(self, tracked: Tracked) -> Tracked:
         """A frame; if it is the second of a segment, after it has told how the first one moved."""
         tracker, world, first = self.camera_tracker, self.map.world, self.camera_tracker.reference
-        if first is None or self.keyframes.frames_since or not tracked.status.by_image:
+        if not self.camera.rolling_shutter_s or first is None or self.keyframes.frames_since:
             return tracked
         previous = tracker.motion.previous(tracker.lost_frames)
-        if previous is None or world.in_segment(first.segment) != [first]:
+        alone = world.in_segment(first.segment) == [first]
+        if previous is None or not alone or not tracked.status.by_image:
             return tracked
         found = beginning(world, first, previous, tracked, self.camera)
         if found is None:

@@ -14,7 +14,7 @@ from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.features.brisk import Features, select
 from bmask_slam.graph.arrays import Array, Ints, no_ids
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import inverse, se3_log, transform
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.tracking.pose_optimisation import optimise_pose
 from bmask_slam.tracking.results import Tracked
 from bmask_slam.tracking.rolling_shutter import (
@@ -22,7 +22,6 @@ from bmask_slam.tracking.rolling_shutter import (
     PreviousPose,
     after_mean_row_s,
     at_one_moment,
-    motion_since,
     velocities,
 )
 from bmask_slam.world.frame_observations import FrameObservations
@@ -78,18 +77,15 @@ def beginning(
 
     Nothing was known of the keyframe's motion, so that a rolling shutter has bent its landmarks,
     and with them the pose of the frame after it. Both are interpreted anew by the motion between
-    them until that changes no more. None where it is not known, and with a global shutter.
+    them until that changes no more. None where no pose fits that.
     """
-    found = motion_since(previous, tracked.T_world_camera, camera)
-    if found is None:
-        return None
     points = world.landmarks.points_world[tracked.landmark_ids]
     points = transform(inverse(keyframe.T_world_camera), points)  # which only the keyframe has seen
     mean_s = camera.exposed_after_s(keyframe.features.image_pixels[:, 1]).mean()
     later_s = camera.exposed_after_s(camera.project_distorted(points)[:, 1]) - mean_s
-    T, taken = tracked.T_world_camera, found.twist
+    T, taken = tracked.T_world_camera, previous.twist_to(tracked.T_world_camera)
     for _ in range(BEGINNING_ROUNDS):
-        twist = se3_log(inverse(previous.T_world_camera) @ T) / previous.ago_s
+        twist = previous.twist_to(T)
         still = points - later_s[:, None] * velocities(points, twist)
         second = reinterpreted(tracked.features, KeyframeMotion(twist, was=taken), camera, camera)
         matched = select(second, tracked.keypoints)
@@ -121,10 +117,10 @@ def use_camera(mapper: Mapper, camera: Camera, motions: Mapping[int, KeyframeMot
         logger.info("graph: %s", note)
     read_back(mapper.world, estimate)
     for keyframe in known:
-        place_landmarks(mapper.world, keyframe, camera)
+        _place_landmarks(mapper.world, keyframe, camera)
 
 
-def place_landmarks(world: WorldMap, keyframe: Keyframe, camera: Camera) -> None:
+def _place_landmarks(world: WorldMap, keyframe: Keyframe, camera: Camera) -> None:
     """Put the landmarks that only this keyframe has seen where its features have them now."""
     rows, ids = world.observed(keyframe)
     landmarks, features = world.landmarks, keyframe.features

@@ -30,6 +30,10 @@ class PreviousPose:
     T_world_camera: Array
     ago_s: float
 
+    def twist_to(self, T_world_camera: Array) -> Array:
+        """The mean velocity (6,) from it to the image's pose (4, 4)."""
+        return se3_log(inverse(self.T_world_camera) @ T_world_camera) / self.ago_s
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -45,8 +49,7 @@ def motion_since(
     """The mean motion from a pose to another; None if unknown, or with a global shutter."""
     if previous is None or camera.rolling_shutter_s == 0:
         return None
-    between = inverse(previous.T_world_camera) @ T_world_camera
-    return Motion(se3_log(between) / previous.ago_s, ACCELERATION * previous.ago_s)
+    return Motion(previous.twist_to(T_world_camera), ACCELERATION * previous.ago_s)
 
 
 def velocities(points_camera: Array, twist: Array) -> Array:
