@@ -173,13 +173,14 @@ class Worker:
         return self._channel.receive(timeout_s)
 
     def stop(self, timeout_s: float = 5.0) -> None:
-        """Let it handle what was sent, then end it; kill it if that takes longer."""
+        """Let it handle what was sent, receive its answers, then end it; kill it if it is slow."""
         self._channel.finish(timeout_s)
         try:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             logger.warning("%s does not end; killed", self.name)
             self.kill()
+        self._channel.drain(timeout_s)
         self._channel.close()
 
     def kill(self) -> None:

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -85,8 +86,15 @@ def test_messages_of_any_size_are_echoed_in_order(caplog) -> None:
     worker.stop()
 
 
-def test_messages_before_a_stop_are_processed() -> None:
+def test_messages_before_a_stop_are_processed(monkeypatch) -> None:
     worker = Worker("echo", f"{HERE}:echo", "a")
+    unpack = Channel._unpack
+
+    def unpack_slowly(self: Channel, *packed: Any) -> Any:
+        time.sleep(0.005)  # the worker ends before its answers have been read
+        return unpack(self, *packed)
+
+    monkeypatch.setattr(Channel, "_unpack", unpack_slowly)
     for k in range(50):
         worker.send(k)
     worker.stop()
