@@ -33,7 +33,7 @@ from bmask_slam.commands.sequences import add_convert, add_download, add_info, a
 from bmask_slam.commands.show import add_doctor, add_film, add_report, add_view
 from bmask_slam.graph.errors import InputError, did_you_mean, one_line
 from bmask_slam.graph.extras import import_extra
-from bmask_slam.runtime.memory import is_out_of_memory, memory_limit_bytes
+from bmask_slam.runtime.memory import is_out_of_memory, keep_little_memory, memory_limit_bytes
 from bmask_slam.runtime.stop_request import SIGNALS
 
 ADDED = (
@@ -100,6 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     for name, value in WAITING.items():
         os.environ.setdefault(name, value)
+    keep_little_memory()
     try:
         arguments = make_parser().parse_args(argv)
         _check_memory()

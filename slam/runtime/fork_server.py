@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 from bmask_slam.runtime.forked_process import NUMBER, ForkedProcess
+from bmask_slam.runtime.memory import keep_little_memory
 from bmask_slam.runtime.stop_request import SIGNALS
 
 logger = logging.getLogger(__name__)
@@ -169,6 +170,7 @@ def serve() -> None:
         if number is not signal.SIGTERM:
             signal.signal(number, signal.SIG_IGN)
     gc.disable()  # what is loaded stays
+    keep_little_memory()
     control = socket.socket(fileno=os.dup(0))
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)

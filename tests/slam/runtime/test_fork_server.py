@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import platform
 import resource
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import pytest
 from faults import LONG_S, running, wait_until
+from heaps import thread_uses_main_heap
 
 from bmask_slam.runtime import forked_process
 from bmask_slam.runtime.fork_server import (
@@ -57,6 +59,10 @@ def says_where_it_is(pipe: int) -> None:
     os.write(pipe, "\n".join(words).encode())
 
 
+def says_whose_heap(pipe: int) -> None:
+    os.write(pipe, str(thread_uses_main_heap()).encode())
+
+
 def exits_with_3(pipe: int) -> None:
     sys.stdout.flush()
     os._exit(3)
@@ -79,6 +85,14 @@ def test_a_process_has_its_owners_surroundings_and_the_servers_modules(
     assert process.wait(LONG_S) == 0
     with os.fdopen(pipe) as said:
         assert said.read().split("\n") == [str(tmp_path), "set", str(has_numpy)]
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators differ")
+def test_the_threads_of_a_process_share_a_heap(server: ForkServer, tmp_path: Path) -> None:
+    process, pipe = started(server, "says_whose_heap", tmp_path)
+    assert process.wait(LONG_S) == 0
+    with os.fdopen(pipe) as said:
+        assert said.read() == "True"
 
 
 def test_a_module_that_cannot_be_loaded_is_left_to_the_process(

@@ -1,7 +1,8 @@
-"""The peak of memory counts the processes that this one has."""
+"""The peak of memory counts a process's children; its threads share one heap."""
 
 from __future__ import annotations
 
+import platform
 import subprocess
 import sys
 
@@ -27,3 +28,17 @@ def test_the_peak_counts_children_and_their_children() -> None:
         assert before + 0.9e-6 * SIZE < peak_rss_mb() < before + 1.5e-6 * SIZE
         process.communicate()
     assert peak_rss_mb() < before + 0.5e-6 * SIZE
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators differ")
+@pytest.mark.parametrize("runs_a_command", [False, True])
+def test_the_threads_of_the_command_line_share_a_heap(runs_a_command: bool) -> None:
+    code = (
+        f"import sys; sys.path[:0] = {sys.path!r}\n"
+        "from heaps import thread_uses_main_heap\n"
+        "from bmask_slam.cli import main\n"
+        f"{runs_a_command} and main(['info', 'nothing'])\n"
+        "print(thread_uses_main_heap())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines() == [str(runs_a_command)], done.stderr
