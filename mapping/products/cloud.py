@@ -21,7 +21,7 @@ class Cloud:
         sigmas_m: (N,) float32, standard deviation.
         labels: (N,) uint16, most probable class; 0 is the background.
         probabilities: (N,) float32 of that class.
-        views: (N,) uint16, number of frames that saw the point.
+        views: (N,) uint16, number of frames that saw the point, 0 in a hole that was closed.
     """
 
     points: Floats

@@ -26,6 +26,7 @@ from bmask_slam.mapping.products.pictures import palette, write_picture
 from bmask_slam.mapping.products.surface_labels import LabelledView, LabelTable, rows_seen, views_of
 from bmask_slam.mapping.products.surface_regions import StuffFusion
 from bmask_slam.mapping.surface.extraction import Surface
+from bmask_slam.mapping.surface.holes import close_holes
 from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.run_folder.semantic_files import OBJECTS, read_objects
 from bmask_slam.semantics.beliefs.surface_geometry import FLOORS, Ground, find_ground
@@ -81,7 +82,7 @@ def write_products(
         InputError: nothing can be seen of it, or the disk is full.
     """
     grown = grown or GrownSurface(make_surface(fused, progress), 0, frames_a_keyframe(fused))
-    surface, evidence = grown.surface, KeyframeEvidence(fused)
+    surface, evidence = close_holes(grown.surface), KeyframeEvidence(fused)
     if not len(surface.vertices):
         raise InputError(f"{fused.run.path}: no surface: too few keyframes have depth")
     views = evidence.views(surface.vertices)
@@ -176,7 +177,7 @@ def _labelled(surface: Surface, views: csr_matrix, table: LabelTable, alike: flo
             points, normals = surface.vertices[some], surface.normals[some]
             labels[some], probabilities[some] = table.labels(views[some], points, normals)
     sigmas_m = np.sqrt(1e-4 * alike / surface.weights).astype(np.float32)
-    frames = np.clip(surface.views, 1, 65535).astype(np.uint16)
+    frames = np.clip(surface.views, 0, 65535).astype(np.uint16)
     return Cloud(
         surface.vertices, surface.normals, surface.colours, sigmas_m, labels, probabilities, frames
     )
