@@ -13,7 +13,7 @@ from bmask_slam.graph.errors import MAX_NUMBER
 from bmask_slam.graph.lens import columns, distort_normalised, undistort_normalised
 
 NO_DEPTH_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
-MAX_SIDE_PX = 65_535
+MAX_SIDE_PX, MAX_REDUCTION = 65_535, 4
 LEAST = 1e-9  # smaller focal lengths, scales and rates overflow where they are divided by
 KINECT_DISPARITY_SIGMA_PX = 0.08
 NOISE_DISTANCES_M = np.linspace(0.3, 8.0, 78)
@@ -98,6 +98,8 @@ class Camera:
     mounted sideways or upside down; "": not said.
     ``covered`` are parts of the image that do not show the room: the robot itself, an overlay, dirt
     on the lens. Rectangles (left, top, right, bottom) in pixels, the last column and row excluded.
+    ``reduced_by``: images are recorded so many times as wide and high, and reduced when they are
+    read; all else is of the reduced ones.
     """
 
     width: int
@@ -117,14 +119,16 @@ class Camera:
     depth_distortion: tuple[float, float, float, float, float] = NO_DEPTH_DISTORTION
     up: str = ""
     covered: tuple[tuple[int, int, int, int], ...] = ()
+    reduced_by: int = 1
 
     def fault(self) -> str:
         """What no camera can be, in words; "" for a possible camera."""
-        others = ("depth_noise", "up", "covered")
-        numbers = [getattr(self, f.name) for f in fields(self) if f.name not in others]
-        flat: Array = np.concatenate([np.ravel(number) for number in numbers]).astype(float)
+        names = {f.name for f in fields(self)} - {"depth_noise", "up", "covered"}
+        flat: Array = np.concatenate([np.ravel(getattr(self, n)) for n in names]).astype(float)
         if not (np.abs(flat) <= MAX_NUMBER).all():
             return "a number that is not finite"
+        if not 1 <= self.reduced_by <= MAX_REDUCTION:
+            return f"images reduced by {self.reduced_by}"
         if not (1 <= self.width <= MAX_SIDE_PX and 1 <= self.height <= MAX_SIDE_PX):
             return f"an image of {self.width} x {self.height} pixels"
         if min(self.fx, self.fy, self.depth_scale, self.fps, self.stereo_bf_px_m) < LEAST:
@@ -159,6 +163,24 @@ class Camera:
             return self.depth_noise
         sigma_px = KINECT_DISPARITY_SIGMA_PX if disparity_sigma_px is None else disparity_sigma_px
         return DepthNoise.of_disparity(sigma_px, self.stereo_bf_px_m)
+
+    def reduced(self, k: int) -> Camera:
+        """The camera of images of a k-th of the width and height, which it must divide."""
+        return replace(self._scaled(1 / k), reduced_by=k * self.reduced_by)
+
+    def recorded(self) -> Camera:
+        """The camera of the images as they are recorded."""
+        return replace(self._scaled(self.reduced_by), reduced_by=1) if self.reduced_by > 1 else self
+
+    def _scaled(self, factor: float) -> Camera:
+        """With edges so many times as long. The noise of the depth in metres stays the same."""
+        parts = factor * np.array(self.covered, float).reshape(-1, 4)
+        parts = np.concatenate([np.floor(parts[:, :2]), np.ceil(parts[:, 2:])], axis=1).astype(int)
+        return replace(
+            self, width=round(self.width * factor), height=round(self.height * factor),
+            fx=self.fx * factor, fy=self.fy * factor, cx=(self.cx + 0.5) * factor - 0.5,
+            cy=(self.cy + 0.5) * factor - 0.5, covered=tuple(map(tuple, parts.tolist())),
+        )  # fmt: skip
 
     def turned(self, turns: int) -> tuple[Camera, Array]:
         """The camera of images turned anticlockwise by right angles, and T_self_turned (4, 4).
@@ -207,8 +229,7 @@ class Camera:
 
     def image_places(self, pixels: Array) -> Array:
         """Pixels (..., 2) from the middle of the image, in units of half its width."""
-        middle = np.array([self.width - 1, self.height - 1]) / 2
-        return (pixels - middle) * (2 / self.width)
+        return (pixels - np.array([self.width - 1, self.height - 1]) / 2) * (2 / self.width)
 
     def share_of_rows(self, rows: Array) -> Array:
         """Offsets (N,) of rows (N,) below the image's middle, as shares of its height, +-1/2."""
@@ -259,8 +280,7 @@ class Camera:
 def depth_distortion_terms(places: Array) -> Array:
     """The terms (..., 5) x, y, x^2, xy, y^2 of ``Camera.depth_distortion``.
 
-    ``places`` (..., 2) are those of ``Camera.image_places``. A constant is missing: it is hardly
-    told from the depth's scale and offset.
+    At ``Camera.image_places`` (..., 2). A constant could hardly be told from the depth's scale.
     """
     x, y = np.moveaxis(places, -1, 0)
     return np.stack([x, y, x * x, x * y, y * y], axis=-1)

@@ -38,6 +38,17 @@ warnings.filterwarnings("ignore", module=r"PIL\.")  # said here in one line
 _COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 
+def reduction(size: tuple[int, ...], wanted: tuple[int, ...]) -> int:
+    """How many times as wide and as high as ``wanted`` a size (H, W) is; 0: no whole number."""
+    k = size[0] // wanted[0]
+    return k if size == tuple(k * side for side in wanted) else 0
+
+
+def reduced_labels(values: NDArray, k: int) -> NDArray:
+    """Values (k H, k W) that have no mean, at a k-th of their size."""
+    return values[k // 2 :: k, k // 2 :: k]
+
+
 def read_colour(path: Path) -> Image:
     """A colour image (H, W, 3), red first; grey images are expanded.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -11,7 +12,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.coco_files import MAX_MASK_BYTES, CocoImage, read_coco
-from bmask_slam.semantics.instances.image_files import decode_image
+from bmask_slam.semantics.instances.image_files import decode_image, reduced_labels, reduction
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.instances.surface_files import read_surfaces, surface_labels
 from bmask_slam.semantics.instances.surfaces import Segmented
@@ -86,7 +87,7 @@ class CocoSegmenter:
         self._surface_labels = surface_labels(path.parent)
 
     def segment(self, image: Image, name: str) -> list[Instance]:
-        """The instances in the file for the image of this name.
+        """The instances in the file for the image of this name, which may be a reduced one.
 
         Raises:
             InputError: the file does not have the image, or in another size.
@@ -95,15 +96,20 @@ class CocoSegmenter:
         known = self._images.get(Path(name).as_posix())
         if known is None:
             raise InputError(f"{self.path}: has no image {name}; make the masks of this sequence")
-        if image.shape[:2] != (known.height, known.width):
+        size = image.shape[:2]
+        k = reduction((known.height, known.width), size)
+        if not k:
             raise InputError(
                 f"{self.path}: {name} has {known.width}x{known.height} pixels there, but "
                 f"{image.shape[1]}x{image.shape[0]} here; make the masks of this sequence"
             )
         found = sorted(_instances(known, len(self.labels)), key=lambda i: -i.mask_score)
+        if k > 1:
+            found = [
+                replace(i, mask=reduced_labels(i.mask, k), box=i.box / np.float32(k)) for i in found
+            ]
         if self._surface_labels is None:
             return found
-        size = (known.height, known.width)
         return Segmented(found, read_surfaces(self.path.parent, name, self._surface_labels, size))
 
 
@@ -127,19 +133,21 @@ class LabelImageSegmenter:
         self.labels = labels
 
     def segment(self, image: Image, name: str) -> list[Instance]:
-        """One instance for each value in the PNG except 0.
+        """One instance for each value in the PNG except 0; the image may be a reduced one.
 
         Raises:
             InputError: no PNG for the image, one of another size, or a label that is not known.
         """
         check_image(image, name)
         path = self._file(name)
-        values = decode_image(path, cv2.IMREAD_UNCHANGED)
-        if values.shape != image.shape[:2]:
+        values, size = decode_image(path, cv2.IMREAD_UNCHANGED), image.shape[:2]
+        k = reduction(values.shape, size) if values.ndim == 2 else 0
+        if not k:
             raise InputError(
-                f"{path}: shape {values.shape}, but the image has {image.shape[:2]}; "
+                f"{path}: shape {values.shape}, but the image has {size}; "
                 "label images have one channel and their image's size"
             )
+        values = reduced_labels(values, k)
         found, present = [], np.unique(values[values > 0])
         if len(present) * values.size > MAX_MASK_BYTES:
             raise InputError(

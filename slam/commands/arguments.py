@@ -47,10 +47,14 @@ def print_result(
     print(short if arguments.quiet else format_json(result) if arguments.json else text())
 
 
-def add_camera_argument(parser: argparse.ArgumentParser) -> None:
-    """Add --camera."""
+def add_camera_argument(parser: argparse.ArgumentParser, of_copy: bool = False) -> None:
+    """Add --camera; and --full-size, but where images are only copied."""
     text = "camera.yaml in place of its own, or a model such as kinect-v1 for what that leaves out"
     parser.add_argument("--camera", type=Path, metavar="F", help=text)
+    if of_copy:
+        return
+    text = "do not reduce large images; they are tracked slower, and worse where the camera is fast"
+    parser.add_argument("--full-size", action="store_true", default=None, help=text)
 
 
 def add_mesh_voxel_argument(parser: argparse.ArgumentParser) -> None:

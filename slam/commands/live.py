@@ -147,6 +147,7 @@ def source_options(arguments: argparse.Namespace) -> SourceOptions:
         sensors = SensorTopics(**_sensor_topics(arguments))
     return SourceOptions(
         camera=arguments.camera,
+        full_size=bool(arguments.full_size),
         realtime=arguments.realtime,
         max_frames=arguments.max_frames,
         follow=arguments.follow,

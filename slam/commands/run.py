@@ -46,6 +46,7 @@ OPTIONS = (
     "dense",
     "mesh_voxel_m",
     "parallel",
+    "full_size",
 )
 
 

@@ -100,7 +100,8 @@ def _info(arguments: argparse.Namespace) -> int:
             topics = {"duration_s": bag.duration_s, "topics": list(bag.topics)}
             print(format_json(topics) if arguments.json else format_topics(bag))
         return 0
-    info = sequence_info(open_sequence(arguments.sequence, camera=arguments.camera))
+    source, camera = arguments.sequence, arguments.camera
+    info = sequence_info(open_sequence(source, camera=camera, full_size=arguments.full_size))
     print(info_as_json(info) if arguments.json else format_info(info))
     return 0
 
@@ -112,7 +113,7 @@ def add_convert(commands: Commands) -> None:
     parser.set_defaults(handler=_convert)
     parser.add_argument("sequence", type=Path, metavar="A", help="recording, as run takes it")
     parser.add_argument("out", type=Path, metavar="B", help="folder to make")
-    add_camera_argument(parser)
+    add_camera_argument(parser, of_copy=True)
     add_topic_arguments(parser)
     parser.add_argument("--max-frames", type=int, metavar="N", help="only the first N images")
     add_output_arguments(parser, "the folder's path")

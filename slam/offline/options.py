@@ -15,9 +15,9 @@ from bmask_slam.system_config import SystemConfig
 _PATHS = ("sequence", "camera", "reference", "map")
 _RECORDED = (
     *(*_PATHS, "config_name", "max_frames", "stride", "checkpoint_every", "dense"),
-    *("calibrate", "mesh_voxel_m", "parallel"),
+    *("calibrate", "mesh_voxel_m", "parallel", "full_size"),
 )
-_ADDED = {"mesh_voxel_m": None, "parallel": False}
+_ADDED = {"mesh_voxel_m": None, "parallel": False, "full_size": True}
 """What checkpoints written before do not have."""
 _FLAGS = {"map": "--continue", "dense": "--map", "mesh_voxel_m": "--mesh-voxel"}
 """Flags that differ from the name of their field."""
@@ -46,6 +46,7 @@ class RunOptions:
         dense: also make a dense map, fusing keyframes while the run goes on.
         mesh_voxel_m: edge of its voxels, for a preview; None: 0.01.
         parallel: tracking, map and masks each have a process, and work at the same time.
+        full_size: large images are not reduced, as `open_sequence` does otherwise.
         quiet: no progress bar.
     """
 
@@ -65,6 +66,7 @@ class RunOptions:
     dense: bool = False
     mesh_voxel_m: float | None = None
     parallel: bool = False
+    full_size: bool = False
     quiet: bool = False
 
     def __post_init__(self) -> None:

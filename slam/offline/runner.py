@@ -64,7 +64,7 @@ def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummar
         InputError: a broken sequence, reference or map, or a run folder that cannot be used; a
             folder made for this run is removed unless a frame had been processed.
     """
-    sequence = open_sequence(options.sequence, camera=options.camera)
+    sequence = open_sequence(options.sequence, camera=options.camera, full_size=options.full_size)
     reference = find_reference(options.reference, sequence)
     name = "-".join(filter(None, (sequence.name, options.config_name)))
     with (
@@ -161,7 +161,7 @@ def _calibrator(
 
 def _reopened(options: RunOptions, checkpoint: Checkpoint) -> Sequence:
     """The sequence of a run, with the camera that the run has found; else with its own."""
-    sequence = open_sequence(options.sequence, camera=options.camera)
+    sequence = open_sequence(options.sequence, camera=options.camera, full_size=options.full_size)
     own, found = sequence.camera, checkpoint.calibration
     if found.covered:
         own = replace(own, covered=found.given.covered)

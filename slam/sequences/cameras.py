@@ -150,6 +150,7 @@ def _read(path: Path) -> tuple[Camera, set[str]]:
         depth_distortion=_depth_distortion(path, values.get("depth_distortion", [0, 0, 0, 0, 0])),
         up=_up(path, values["up"]) if "up" in values else "",
         covered=_covered(path, values.get("covered", [])),
+        reduced_by=1,
         **optional,
     )
     if bad := camera.not_in_image():
@@ -189,8 +190,9 @@ def write_camera(path: Path, camera: Camera, comment: str = "") -> None:
 def format_camera(camera: Camera, comment: str = "") -> str:
     """The text of a camera.yaml that ``read_camera`` reads back as the same camera.
 
-    It begins with ``comment``, each line after a #.
+    It is that of the images as recorded, and begins with ``comment``, each line after a #.
     """
+    camera = camera.recorded()
     values: dict[str, object] = {key: getattr(camera, key) for key in REQUIRED}
     values |= {"distortion": list(camera.distortion)}
     values |= {key: getattr(camera, name) for key, name in OPTIONAL.items()}

@@ -1,6 +1,6 @@
 """Decoding of colour and depth images, with checks for all ways in which they can be broken.
 
-And undistortion of images whose lens is beyond a camera's five coefficients.
+And reduction of large ones, and undistortion where a lens is beyond a camera's five coefficients.
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Floats, Image
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.camera import MAX_REDUCTION, Camera
 from bmask_slam.graph.errors import MAX_NUMBER, InputError
 from bmask_slam.semantics.instances.image_files import decode_image, read_colour
 
 SURFACE_STEP = 0.05
-"""Relative change of depth from one depth image to the next beyond which the surface changed."""
+"""Relative change of depth, in time or from pixel to pixel, beyond which it is another surface."""
+MIN_WORKING_PX = 225_000
+"""Images are reduced to no fewer pixels, such as 640 x 360."""
 
 
 def read_rgb(path: Path, camera: Camera) -> Image:
@@ -31,7 +33,7 @@ def read_rgb(path: Path, camera: Camera) -> Image:
     """
     rgb = read_colour(path)
     check_size(path, rgb, camera)
-    return rgb
+    return reduced_colour(rgb, camera.reduced_by)
 
 
 def read_depth(path: Path, camera: Camera) -> Floats:
@@ -43,7 +45,49 @@ def read_depth(path: Path, camera: Camera) -> Floats:
     stored = decode_image(path, cv2.IMREAD_UNCHANGED)
     check_depth_type(path, stored, camera)
     check_size(path, stored, camera)
-    return depth_in_metres(stored, camera)
+    return depth_in_metres(reduced_depth(stored, camera.reduced_by), camera)
+
+
+def working_camera(camera: Camera) -> Camera:
+    """The camera of images as they are used: large ones are reduced by a whole number.
+
+    What tracking and map measure in pixels, such as how far a point moves from frame to frame and
+    how large what BRISK describes is, is right for 640 x 480. Larger images, blurred and bent by a
+    moving camera, are then tracked worse, and take several times as long.
+    """
+    width, height = camera.width, camera.height
+    for k in range(MAX_REDUCTION, 1, -1):
+        if width % k == height % k == 0 and width * height >= MIN_WORKING_PX * k**2:
+            return camera.reduced(k)
+    return camera
+
+
+def reduced_colour(rgb: Image, k: int) -> Image:
+    """Colour (k H, k W, 3) at a k-th of its size: the mean of the pixels that become one."""
+    if k == 1:
+        return rgb
+    size = rgb.shape[1] // k, rgb.shape[0] // k
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def reduced_depth(stored: NDArray, k: int) -> NDArray:
+    """Depth (k H, k W) at a k-th of its size, in any unit, 0 or NaN where missing.
+
+    Of the pixels that become one, the mean of those on the nearest surface; 0 if none has depth.
+    """
+    if k == 1:
+        return stored
+    whole = stored.astype(np.float32)
+    whole[~(whole > 0)] = np.inf
+    pixels = [whole[i::k, j::k] for i in range(k) for j in range(k)]
+    limit = np.minimum.reduce(pixels) * np.float32(1 + SURFACE_STEP)
+    limit[np.isinf(limit)] = 0
+    total, count = np.zeros_like(limit), np.zeros_like(limit)
+    for pixel in pixels:
+        near = pixel <= limit
+        np.add(total, pixel, out=total, where=near)
+        count += near
+    return np.divide(total, count, out=np.zeros_like(total), where=count > 0)
 
 
 def check_depth_type(path: Path, stored: NDArray, camera: Camera) -> None:
@@ -104,11 +148,12 @@ def depth_between(near_m: Floats, other_m: Floats, share: float) -> Floats:
 
 
 def check_size(path: Path, image: NDArray, camera: Camera) -> None:
-    """Refuse an image of another size than the camera's. Raises InputError."""
+    """Refuse an image of another size than the camera records. Raises InputError."""
     height, width = image.shape[:2]
-    if (width, height) != (camera.width, camera.height):
+    recorded = camera.width * camera.reduced_by, camera.height * camera.reduced_by
+    if (width, height) != recorded:
         raise InputError(
-            f"{path}: {width}x{height} pixels, but the camera has {camera.width}x{camera.height}; "
+            f"{path}: {width}x{height} pixels, but the camera has {recorded[0]}x{recorded[1]}; "
             "colour and registered depth must both have the size in camera.yaml"
         )
 

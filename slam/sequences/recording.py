@@ -14,7 +14,14 @@ from bmask_slam.graph.arrays import Array, Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.semantics.instances.image_files import decode_image, read_colour
-from bmask_slam.sequences.images import Lens, check_depth_type, check_size, depth_in_metres
+from bmask_slam.sequences.images import (
+    Lens,
+    check_depth_type,
+    check_size,
+    depth_in_metres,
+    reduced_colour,
+    reduced_depth,
+)
 from bmask_slam.sequences.lists import ImageList
 from bmask_slam.sequences.registration import register_depth
 
@@ -89,14 +96,16 @@ class Recording:
     lens: Lens | None = None
 
     def read_rgb(self, file: Path, camera: Camera) -> Image:
-        """The colour image (H, W, 3), red first.
+        """The colour image (H, W, 3), red first, reduced as the camera says.
 
         Raises:
-            InputError: an image that cannot be read, or is of another size than the camera's.
+            InputError: an image that cannot be read, or is of another size than the camera records.
         """
         rgb = self.colour(file)
         check_size(file, rgb, camera)
-        return rgb if self.lens is None else self.lens.undistorted_colour(rgb)
+        if self.lens is not None:
+            rgb = self.lens.undistorted_colour(rgb)
+        return reduced_colour(rgb, camera.reduced_by)
 
     def read_depth(self, file: Path, camera: Camera) -> Floats:
         """Depth (H, W) in metres at the pixels of the colour camera, NaN where missing.
@@ -111,4 +120,5 @@ class Recording:
         stored, form = self.stored_depth(file), self.form
         check_depth_type(file, stored, camera)
         check_size(file, stored, form.camera or camera)
-        return form.on_colour(stored, camera)
+        found = form.on_colour(stored, camera)
+        return found if form.camera else reduced_depth(found, camera.reduced_by)

@@ -67,7 +67,7 @@ def read_right_images(sequence: Sequence, camera: Camera) -> RightImages:
             f"{path}: the run's camera has distortion {list(camera.distortion)}, but rectified "
             "images have none; run the sequence with a camera.yaml whose distortion is 0"
         )
-    camera = replace(camera, stereo_bf_px_m=_stereo_bf(sequence.folder / "camera.yaml"))
+    camera = replace(camera, stereo_bf_px_m=_stereo_bf(sequence.folder / "camera.yaml", camera))
     right = read_list(path)
     i, j = associate_stamps(sequence.timestamps_s, right.timestamps_s, limit_s)
     if not len(i):
@@ -81,12 +81,16 @@ def read_right_images(sequence: Sequence, camera: Camera) -> RightImages:
     return RightImages(path, files, camera)
 
 
-def _stereo_bf(path: Path) -> float:
-    """The stereo_bf that is written in a camera.yaml."""
+def _stereo_bf(path: Path, used: Camera) -> float:
+    """The stereo_bf that is written in a camera.yaml, of images at the size in which they are used.
+
+    Raises:
+        InputError: it has none.
+    """
     cure = "stereo needs its stereo_bf, fx times the pair's baseline in metres"
     if not path.is_file():
         raise InputError(f"{path}: no such file; {cure}")
     camera = read_camera(path)
     if "stereo_bf" not in read_yaml(path):
         raise InputError(f"{path}: stereo_bf is missing; {cure}")
-    return camera.stereo_bf_px_m
+    return camera.stereo_bf_px_m / used.reduced_by

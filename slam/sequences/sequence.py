@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,11 +19,12 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences.bags.topics import split_path
 from bmask_slam.sequences.formats.layouts import open_recording
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.sequences.images import depth_between
+from bmask_slam.sequences.images import depth_between, working_camera
 from bmask_slam.sequences.lists import image_name, pair_images
 from bmask_slam.sequences.prefetch import prefetched
 from bmask_slam.sequences.recording import Recording
 
+T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 DECODED = 4
@@ -95,15 +98,12 @@ class Sequence:
         """
         if not 0 <= index < len(self):
             raise InputError(f"{self.folder}: no frame {index}; there are 0 to {len(self) - 1}")
-        depth_m, lag_s = self.depth(index)
-        return Frame(
-            index,
-            float(self.pairs.timestamps_s[index]),
-            self.rgb(index),
-            depth_m,
-            image_name(self.pairs.rgb_files[index], self.folder),
-            lag_s,
-        )
+        depth = self.depth(index)
+        return self._frame(index, self.rgb(index), *depth)
+
+    def _frame(self, index: int, rgb: Image, depth_m: Floats, lag_s: float) -> Frame:
+        stamp_s, file = float(self.pairs.timestamps_s[index]), self.pairs.rgb_files[index]
+        return Frame(index, stamp_s, rgb, depth_m, image_name(file, self.folder), lag_s)
 
     def rgb(self, index: int) -> Image:
         """The colour image (H, W, 3) of a frame. Raises InputError for a broken one."""
@@ -141,11 +141,11 @@ class Sequence:
     def frames(
         self, start: int = 0, stop: int | None = None, stride: int = 1, prefetch: int = 4
     ) -> Generator[Frame, None, None]:
-        """Decode the frames ``start:stop:stride`` in a thread, up to ``prefetch`` ahead.
+        """Decode the frames ``start:stop:stride``, up to ``prefetch`` ahead.
 
-        Nothing else is done in that thread: it would wait for the interpreter lock again and again,
-        and whoever has it for the thread. Broken frames are skipped with a warning and listed in
-        ``skipped``.
+        Colour and depth have a thread each. Nothing else is done there: it would wait for the
+        interpreter lock again and again, and whoever has it for the thread. Broken frames are
+        skipped with a warning and listed in ``skipped``.
 
         Raises:
             InputError: more than ``max_broken_share`` of the sequence is broken.
@@ -153,16 +153,20 @@ class Sequence:
         """
         if stride < 1:
             raise ValueError(f"stride {stride} must be at least 1")
-        return prefetched(self._decoded(range(len(self))[start:stop:stride]), prefetch)
+        return self._decoded(range(len(self))[start:stop:stride], prefetch)
 
-    def _decoded(self, indices: range) -> Iterator[Frame]:
-        for index in indices:
-            try:
-                frame = self.load(index)
-            except InputError as error:
-                self.skip(index, str(error))
-                continue
-            yield frame
+    def _decoded(self, indices: range, prefetch: int) -> Generator[Frame, None, None]:
+        with (
+            closing(prefetched(_read_each(self.rgb, indices), prefetch)) as colours,
+            closing(prefetched(_read_each(self.depth, indices), prefetch)) as depths,
+        ):
+            for index, rgb, depth in zip(indices, colours, depths, strict=True):
+                if isinstance(depth, InputError):
+                    self.skip(index, str(depth))
+                elif isinstance(rgb, InputError):
+                    self.skip(index, str(rgb))
+                else:
+                    yield self._frame(index, rgb, *depth)
 
     def skip(self, index: int, reason: str) -> None:
         """Record a broken frame; refuse the sequence when there are too many."""
@@ -176,22 +180,39 @@ class Sequence:
             )
 
 
+def _read_each(read: Callable[[int], T], indices: range) -> Iterator[T | InputError]:
+    """What is read for each index, or why it cannot be read."""
+    for index in indices:
+        try:
+            yield read(index)
+        except InputError as error:
+            yield error
+
+
 def open_sequence(
     path: str | os.PathLike[str],
     config: SequenceConfig | None = None,
     camera: str | os.PathLike[str] | Camera | None = None,
+    full_size: bool = False,
 ) -> Sequence:
     """Open a recording in any layout of docs/data.md: TUM's, others' folders, files, ROS bags.
 
-    ``camera``, a file or a camera, replaces its own. Images may be in any order. All checks that
-    need not decode every image are done here.
+    ``camera``, a file or a camera, replaces its own. Large images are reduced, as
+    `images.working_camera` says, but not with ``full_size``, or a camera that is given.
+    Images may be in any order. All checks that need not decode every image are done here.
 
     Raises:
         InputError: naming the file, the value and the cure.
     """
     given = camera if camera is None or isinstance(camera, Camera) else Path(camera)
-    recording = open_recording(Path(path), given)
-    sequence = Sequence(recording, recording.camera, config or SequenceConfig())
+    recorded = given.recorded() if isinstance(given, Camera) else given
+    recording = open_recording(Path(path), recorded)
+    own = recording.camera
+    used = given if isinstance(given, Camera) else own if full_size else working_camera(own)
+    sequence = Sequence(recording, used, config or SequenceConfig())
+    if used.width < own.width:
+        sizes = f"{own.width}x{own.height}, reduced to {used.width}x{used.height}"
+        sequence.camera_source += f", images of {sizes}"
     _check_images(sequence)
     truth = sequence.groundtruth is not None
     text = "%s, %s: %d frames, ground truth: %s"

@@ -17,11 +17,12 @@ from bmask_slam.live.sources.cameras.realsense_camera import RealSenseSource
 from bmask_slam.live.sources.cameras.record3d_camera import Record3dSource
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
 from bmask_slam.live.sources.ros2_source import Ros2Options, Ros2Source
-from bmask_slam.live.sources.source import Limited, RecordedSource, Source
+from bmask_slam.live.sources.source import Limited, RecordedSource, Reduced, Source
 from bmask_slam.sequences.bags.bag_file import is_bag
 from bmask_slam.sequences.bags.sensors import SensorTopics
 from bmask_slam.sequences.bags.topics import BagTopics
 from bmask_slam.sequences.formats.layouts import is_recording_file
+from bmask_slam.sequences.images import working_camera
 from bmask_slam.sequences.sequence import open_sequence
 
 REALSENSE, OAK, OPENCV, ROS2 = "realsense:", "oak:", "opencv:", "ros2:"
@@ -42,6 +43,7 @@ class SourceOptions:
         reliable: ROS 2 sends images again that are lost.
         sensors: topics of ROS 2.
         node: takes part in ROS 2, in place of one of DDS.
+        full_size: large images are not reduced.
     """
 
     camera: Path | None = None
@@ -53,6 +55,7 @@ class SourceOptions:
     reliable: bool = False
     sensors: SensorTopics = field(default_factory=SensorTopics)
     node: Node | None = None
+    full_size: bool = False
 
     def __post_init__(self) -> None:
         if self.max_frames is not None and self.max_frames < 1:
@@ -82,19 +85,23 @@ def open_source(text: str, options: SourceOptions) -> Source:
         follow = FollowOptions(silence_s=options.silence_s)
         source = GrowingFolder(path, options.camera, follow)
     elif path.is_dir() or is_recording_file(path):
-        sequence = open_sequence(path, camera=options.camera)
+        sequence = open_sequence(path, camera=options.camera, full_size=options.full_size)
         source = RecordedSource(sequence, options.realtime)
     else:
         raise InputError(
             f"{text}: not a source; give a recording, a .bag, a bag folder, a .mcap, "
             "realsense:, oak:, azure:, opencv:N, record3d: or ros2:"
         )
+    if not options.full_size and working_camera(source.camera) != source.camera:
+        source = Reduced(source)
     return source if options.max_frames is None else Limited(source, options.max_frames)
 
 
 def ros2_of(source: Source) -> Ros2Source | None:
-    """The source, also of a limited one, if it is ROS 2."""
-    inner = source.source if isinstance(source, Limited) else source
+    """The source, also of a limited or reduced one, if it is ROS 2."""
+    inner = source
+    while isinstance(inner, Limited | Reduced):
+        inner = inner.source
     return inner if isinstance(inner, Ros2Source) else None
 
 

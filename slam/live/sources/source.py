@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from typing import Generic, Protocol, TypeVar
 
@@ -16,6 +16,7 @@ import numpy as np
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.images import reduced_colour, reduced_depth, working_camera
 from bmask_slam.sequences.sequence import Sequence
 
 T = TypeVar("T")
@@ -157,6 +158,34 @@ class Limited:
     def frames(self) -> Iterator[Frame]:
         """Up to ``max_frames`` frames; all if that is None."""
         return islice(self.source.frames(), self._max_frames)
+
+    def close(self) -> None:
+        """Close the other source."""
+        self.source.close()
+
+
+class Reduced:
+    """Another ``source`` whose large images are reduced, as `images.working_camera` says."""
+
+    def __init__(self, source: Source) -> None:
+        self.name, self.camera = source.name, working_camera(source.camera)
+        self.groundtruth = source.groundtruth
+        self.counts, self.waits = source.counts, source.waits
+        self.pairs, self.interpolates = source.pairs, source.interpolates
+        self.source = source
+
+    def use(self, camera: Camera) -> None:
+        """Give later frames their depth by another camera, of the reduced images."""
+        self.camera = camera
+        self.source.use(camera.recorded())
+
+    def frames(self) -> Iterator[Frame]:
+        """The source's frames, reduced."""
+        k = self.camera.reduced_by
+        for frame in self.source.frames():
+            depth_m = reduced_depth(frame.depth_m, k)
+            depth_m[depth_m == 0] = np.nan
+            yield replace(frame, rgb=reduced_colour(frame.rgb, k), depth_m=depth_m)
 
     def close(self) -> None:
         """Close the other source."""

@@ -109,6 +109,28 @@ def test_cached_masks_are_read_back(tmp_path: Path, images: list) -> None:
         again.segment(image[:, :30], "rgb/1.25.png")
 
 
+@pytest.mark.parametrize("kind", ["coco", "label images"])
+def test_masks_of_the_recorded_images_fit_reduced_ones(
+    kind: str, tmp_path: Path, images: list
+) -> None:
+    whole, half = np.zeros((40, 60, 3), np.uint8), np.zeros((20, 30, 3), np.uint8)
+    segmenter: Segmenter
+    if kind == "coco":
+        out = tmp_path / "masks"
+        cache_masks(Drawer(), images, CacheOptions(out, {"name": "x"}), quiet)
+        segmenter = CocoSegmenter(out / ANNOTATIONS)
+    else:
+        values = np.where(rectangle(10, 4, 20, 12), 1001, 0).astype(np.uint16)
+        cv2.imwrite(str(tmp_path / "1.25.png"), values)
+        segmenter = LabelImageSegmenter(tmp_path, LABELS)
+    found, reduced = (segmenter.segment(image, "rgb/1.25.png") for image in (whole, half))
+    assert len(found) == len(reduced) > 0
+    for one, other in zip(found, reduced, strict=True):
+        assert other.mask.shape == (20, 30)
+        assert other.mask.sum() == pytest.approx(one.mask.sum() / 4, rel=0.1)
+        assert other.box == pytest.approx(one.box / 2, abs=1)
+
+
 class Painter(Drawer):
     """Tells classes of all pixels too."""
 

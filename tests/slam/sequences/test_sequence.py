@@ -56,10 +56,10 @@ def test_one_other_thread_works_ahead():
     items.close()
 
 
-def test_early_stop_ends_the_thread(folder):
+def test_early_stop_ends_the_threads(folder):
     frames = open_sequence(folder).frames(prefetch=2)
     next(frames)
-    assert prefetch_threads() == 1
+    assert prefetch_threads() == 2
     frames.close()
     assert prefetch_threads() == 0
 

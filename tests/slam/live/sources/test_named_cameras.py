@@ -240,8 +240,8 @@ def test_azure_gives_metres_seconds_and_red_first(monkeypatch) -> None:
             frames.append(frame)
     assert (asked["device"], asked["stopped"]) == (1, 1)
     assert asked["config"]["synchronized_images_only"]
-    assert [f.rgb[360, 640].tolist() for f in frames] == [[0, 20, 200], [10, 20, 200]]
-    assert [float(f.depth_m[360, 640]) for f in frames] == pytest.approx([1.0, 1.001])
+    assert [f.rgb[180, 320].tolist() for f in frames] == [[0, 20, 200], [10, 20, 200]]
+    assert [float(f.depth_m[180, 320]) for f in frames] == pytest.approx([1.0, 1.001])
     assert [f.timestamp_s for f in frames] == pytest.approx([5.0, 5.033333])
     assert (source.counts.unpaired_rgb, source.counts.unpaired_depth) == (0, 1)
 
