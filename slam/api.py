@@ -36,6 +36,7 @@ class RunKeywords(TypedDict, total=False):
     dense: bool
     mesh_voxel_m: float
     parallel: bool
+    full_size: bool
     quiet: bool
 
 

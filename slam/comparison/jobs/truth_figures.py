@@ -22,7 +22,7 @@ from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.graph.trajectory import associate, nearest_indices, read_tum
 from bmask_slam.run_folder.frame_file import FRAMES, read_frames
 from bmask_slam.run_folder.semantic_files import LABELS, read_labels
-from bmask_slam.semantics.instances.image_files import decode_image
+from bmask_slam.semantics.instances.image_files import decode_image, reduced_labels
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
 from bmask_slam.sequences.sequence import Sequence, open_sequence
@@ -160,6 +160,6 @@ def true_depth(sequence: Sequence, index: int) -> Array:
 
 
 def truth_image(sequence: Sequence, kind: str, index: int) -> NDArray[np.uint16]:
-    """The image of a frame in the folder ``kind`` of a rendered sequence."""
-    name = sequence.pairs.rgb_files[index].name
-    return decode_image(sequence.folder / kind / name, cv2.IMREAD_UNCHANGED)
+    """The image of a frame in the folder ``kind`` of a rendered sequence, reduced as its images."""
+    name, k = sequence.pairs.rgb_files[index].name, sequence.camera.reduced_by
+    return reduced_labels(decode_image(sequence.folder / kind / name, cv2.IMREAD_UNCHANGED), k)

@@ -121,8 +121,9 @@ def test_masks_of_the_recorded_images_fit_reduced_ones(
         segmenter = CocoSegmenter(out / ANNOTATIONS)
     else:
         values = np.where(rectangle(10, 4, 20, 12), 1001, 0).astype(np.uint16)
-        cv2.imwrite(str(tmp_path / "1.25.png"), values)
-        segmenter = LabelImageSegmenter(tmp_path, LABELS)
+        (tmp_path / "labels").mkdir()
+        cv2.imwrite(str(tmp_path / "labels/1.25.png"), values)
+        segmenter = LabelImageSegmenter(tmp_path / "labels", LABELS)
     found, reduced = (segmenter.segment(image, "rgb/1.25.png") for image in (whole, half))
     assert len(found) == len(reduced) > 0
     for one, other in zip(found, reduced, strict=True):
