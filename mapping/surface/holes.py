@@ -28,7 +28,9 @@ def close_holes(surface: Surface, most_m: float = MAX_BORDER_M) -> Surface:
     joined = coo_matrix((np.ones(len(border), np.int8), tuple(border.T)), (count, count))
     hole = connected_components(joined, directed=False)[1][border[:, 0]]
     around_m = np.bincount(hole, np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1), minlength=1)
-    border, hole = (rows[around_m[hole] <= most_m] for rows in (border, hole))
+    begun, ended = (np.bincount(border[:, k], minlength=count) for k in (0, 1))
+    no_ring = np.bincount(hole, (begun != ended)[border].any(axis=1), minlength=1) > 0
+    border, hole = (rows[((around_m <= most_m) & ~no_ring)[hole]] for rows in (border, hole))
     if not len(border):
         return surface
     which, hole = np.unique(hole, return_inverse=True)

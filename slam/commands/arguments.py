@@ -53,7 +53,7 @@ def add_camera_argument(parser: argparse.ArgumentParser, of_copy: bool = False) 
     parser.add_argument("--camera", type=Path, metavar="F", help=text)
     if of_copy:
         return
-    text = "do not reduce large images; they are tracked slower, and worse where the camera is fast"
+    text = "do not reduce large images: slower, more exact only where the camera moves slowly"
     parser.add_argument("--full-size", action="store_true", default=None, help=text)
 
 

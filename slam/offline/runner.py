@@ -279,9 +279,10 @@ def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSyste
         return make_system(sequence.camera, options.config)
     state, camera = read_map(source)
     if options.map and (differing := _differing(camera, sequence.camera)):
+        size = "give --full-size; " if camera.reduced_by < sequence.camera.reduced_by else ""
         raise InputError(
-            f"{source}: made with another camera than that of {sequence.folder} ({differing}); a "
-            "map can only be continued with its own camera (--localise accepts any)"
+            f"{source}: made with another camera than that of {sequence.folder} ({differing}); "
+            f"{size}a map can only be continued with its own camera (--localise accepts any)"
         )
     make = MapLocalisation if options.localise else make_system
     system = make(sequence.camera, options.config)

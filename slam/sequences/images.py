@@ -52,8 +52,8 @@ def working_camera(camera: Camera) -> Camera:
     """The camera of images as they are used: large ones are reduced by a whole number.
 
     What tracking and map measure in pixels, such as how far a point moves from frame to frame and
-    how large what BRISK describes is, is right for 640 x 480. Larger images, blurred and bent by a
-    moving camera, are then tracked worse, and take several times as long.
+    how large what BRISK describes is, is right for 640 x 480. Larger images take longer, and where
+    the camera moves fast they are tracked no better.
     """
     width, height = camera.width, camera.height
     for k in range(MAX_REDUCTION, 1, -1):

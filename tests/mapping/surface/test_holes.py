@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -94,3 +96,11 @@ def test_large_holes_and_the_outer_border_stay() -> None:
     assert close_holes(open_sheet) is open_sheet
     assert close_holes(sheet(square(9, 12, 6)), most_m=0.4).views[-1] == 0
     assert close_holes(NOTHING) is NOTHING
+
+
+def test_what_is_no_ring_stays() -> None:
+    """Three triangles at an edge, two of them in its direction: no border leads around anything."""
+    whole = sheet()
+    fan = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]])
+    book = replace(whole, triangles=fan)
+    assert close_holes(book) is book

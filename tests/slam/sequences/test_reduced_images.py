@@ -179,3 +179,6 @@ def test_a_run_on_large_images(rendered: Callable[[RenderConfig], Path], tmp_pat
         used = read_run(out).camera
         assert (used.width, used.reduced_by) == (width, k)
         assert open_sequence(source, camera=used).load(0).rgb.shape[1] == width
+    older = RunOptions(source, out=tmp_path / "on", map=tmp_path / "run1", quiet=True)
+    with pytest.raises(InputError, match="give --full-size"):
+        run(older)
