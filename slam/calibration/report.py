@@ -118,12 +118,21 @@ def format_calibration(done: Calibrated) -> str:
         _residual(done),
         f"noise: pixels {noise_px:.2f} and depths {noise_depth:.2f} times their nominal sigmas; "
         f"{100 * result.inlier_share:.1f} % within 3 sigma",
+        *_of_reduced(done.camera),
         "",
         *table,
         "",
         *_statements(done),
     ]
     return "\n".join(lines)
+
+
+def _of_reduced(camera: Camera) -> list[str]:
+    """What the table is of, where the file is not of the same images."""
+    if camera.reduced_by == 1:
+        return []
+    used, own = (f"{c.width}x{c.height}" for c in (camera, camera.recorded()))
+    return [f"the table is of images reduced to {used}, the file of the recorded ones, {own}"]
 
 
 def plain_calibration(done: Calibrated) -> dict[str, Any]:

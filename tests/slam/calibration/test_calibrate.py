@@ -51,6 +51,11 @@ def test_a_wrong_camera_and_delayed_depth_are_found(
     second_order = np.where(np.arange(18) == TIME, 1e-4, 1e-9)  # in the 10 ms
     assert (np.abs(error) <= 3.5 * done.sigmas + second_order).all()
     assert "not observable" not in format_calibration(done)
+    assert "reduced" not in format_calibration(done)
+    of_reduced = dataclasses.replace(found, reduced_by=2)
+    text = format_calibration(dataclasses.replace(done, camera=of_reduced))
+    used, own = (f"{k * found.width}x{k * found.height}" for k in (1, 2))
+    assert f"images reduced to {used}, the file of the recorded ones, {own}" in text
 
 
 @pytest.mark.parametrize("known_s", [0.0, 0.020])
