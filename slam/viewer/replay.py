@@ -56,7 +56,8 @@ def replay(path: Path, scene: Scene, options: ReplayOptions | None = None) -> in
     trajectory = run.trajectories["trajectory.txt"]
     table = read_frames(path / FRAMES)
     scene.set_time(float(trajectory.timestamps_s[0]) if len(trajectory) else 0.0)
-    pictures = ReplayPictures(path, options.sequence, table) if options.images else None
+    told = path, options.sequence, table, run.camera
+    pictures = ReplayPictures(*told) if options.images else None
     scene.log_names(pictures.names if pictures else ())
     _show_map(run, scene)
     try:

@@ -9,6 +9,7 @@ import numpy as np
 
 from bmask_slam.datasets.weights import find_weights
 from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, nearest_indices
 from bmask_slam.labelling.upright_images import upright_of
@@ -33,12 +34,15 @@ class ReplayPictures:
     What is not there any more (the recording, the network) is left out, with a warning.
     """
 
-    def __init__(self, run: Path, sequence: Path | None, frames: FrameTable) -> None:
+    def __init__(
+        self, run: Path, sequence: Path | None, frames: FrameTable, camera: Camera
+    ) -> None:
+        """Images are those of the run's ``camera``; its recording may be in ``sequence`` now."""
         self._images, self._masked = self._chosen(frames)
         self._segmenter: Segmenter | None = None
         self._sequence = None
         try:
-            self._sequence = open_sequence(sequence or find_sequence(run))
+            self._sequence = open_sequence(sequence or find_sequence(run), camera=camera)
             folder, options = self._sequence.folder, run_semantics(run).segmenter
             if self._masked:
                 upright = upright_of(options, self._sequence)

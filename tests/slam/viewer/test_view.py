@@ -25,6 +25,7 @@ from bmask_slam.offline import runner
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.run_folder.frame_file import read_frames
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
+from bmask_slam.sequences.cameras import read_camera
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 from bmask_slam.viewer.replay_pictures import ReplayPictures
 from bmask_slam.viewer.scene import Scene, ViewOptions
@@ -103,7 +104,8 @@ def test_a_run_whose_masks_lack_images_is_shown_without_them(tmp_path, caplog) -
     segmenter = f"{{name: precomputed, masks: {tmp_path / 'masks.json'}}}"
     (run / "config.yaml").write_text(f"semantics: {{segmenter: {segmenter}}}")
     frames, scene = read_frames(run / "frames.csv"), Scene("a", ViewOptions(tmp_path / "a.rrd"))
-    pictures = ReplayPictures(run, sequence, frames)
+    camera = read_camera(sequence / "camera.yaml")
+    pictures = ReplayPictures(run, sequence, frames, camera)
     assert pictures.names == ("background", "cup")
     for line, stamp_s in enumerate(frames.timestamps_s.tolist()):
         pictures.show(line, stamp_s, scene)
