@@ -15,9 +15,8 @@ from bmask_slam.graph.lens import columns, distort_normalised, undistort_normali
 NO_DEPTH_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 MAX_SIDE_PX, MAX_REDUCTION = 65_535, 4
 LEAST = 1e-9  # smaller focal lengths, scales and rates overflow where they are divided by
-KINECT_DISPARITY_SIGMA_PX = 0.08
 NOISE_DISTANCES_M = np.linspace(0.3, 8.0, 78)
-MAX_NOISE_SHARE, MAX_GRAPH_FACTOR = 0.2, 10.0
+KINECT_DISPARITY_SIGMA_PX, MAX_NOISE_SHARE, MAX_GRAPH_FACTOR = 0.08, 0.2, 10.0
 SIDES = ("top", "right", "bottom", "left")
 """Of an image; the number of right angles that it is turned anticlockwise to have that side up."""
 _QUARTER = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -166,20 +165,24 @@ class Camera:
 
     def reduced(self, k: int) -> Camera:
         """The camera of images of a k-th of the width and height, which it must divide."""
-        return replace(self._scaled(1 / k), reduced_by=k * self.reduced_by)
+        size = self.width // k, self.height // k
+        return replace(self.of_size(*size), reduced_by=k * self.reduced_by)
 
     def recorded(self) -> Camera:
         """The camera of the images as they are recorded."""
-        return replace(self._scaled(self.reduced_by), reduced_by=1) if self.reduced_by > 1 else self
+        if (k := self.reduced_by) == 1:
+            return self
+        return replace(self.of_size(k * self.width, k * self.height), reduced_by=1)
 
-    def _scaled(self, factor: float) -> Camera:
-        """With edges so many times as long. The noise of the depth in metres stays the same."""
-        parts = factor * np.array(self.covered, float).reshape(-1, 4)
-        parts = np.concatenate([np.floor(parts[:, :2]), np.ceil(parts[:, 2:])], axis=1).astype(int)
+    def of_size(self, width: int, height: int) -> Camera:
+        """The camera of the same view in another size. The noise of depth in metres stays."""
+        x, y = width / self.width, height / self.height
+        parts = np.array(self.covered, float).reshape(-1, 4) * [x, y, x, y]
+        parts[:, 2:] = np.ceil(parts[:, 2:])  # and the upper left corner is rounded down
         return replace(
-            self, width=round(self.width * factor), height=round(self.height * factor),
-            fx=self.fx * factor, fy=self.fy * factor, cx=(self.cx + 0.5) * factor - 0.5,
-            cy=(self.cy + 0.5) * factor - 0.5, covered=tuple(map(tuple, parts.tolist())),
+            self, width=width, height=height, fx=x * self.fx, fy=y * self.fy,
+            cx=(self.cx + 0.5) * x - 0.5, cy=(self.cy + 0.5) * y - 0.5,
+            covered=tuple(map(tuple, parts.astype(int).tolist())),
         )  # fmt: skip
 
     def turned(self, turns: int) -> tuple[Camera, Array]:
@@ -280,7 +283,8 @@ class Camera:
 def depth_distortion_terms(places: Array) -> Array:
     """The terms (..., 5) x, y, x^2, xy, y^2 of ``Camera.depth_distortion``.
 
-    At ``Camera.image_places`` (..., 2). A constant could hardly be told from the depth's scale.
+    ``places`` (..., 2) are those of ``Camera.image_places``. A constant is missing: it is hardly
+    told from the depth's scale and offset.
     """
     x, y = np.moveaxis(places, -1, 0)
     return np.stack([x, y, x * x, x * y, y * y], axis=-1)
@@ -292,9 +296,5 @@ def side_towards(direction_camera: Array) -> str:
 
 
 def direction_of(side: str) -> Array:
-    """The direction (3,) of a side of the image in the camera's frame; of the top for "".
-
-    Raises:
-        ValueError: there is no such side.
-    """
+    """The direction (3,) of a side in the camera's frame; of the top for "". Raises ValueError."""
     return np.array(_DIRECTIONS[SIDES.index(side or SIDES[0])])

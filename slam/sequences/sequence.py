@@ -210,7 +210,7 @@ def open_sequence(
     own = recording.camera
     used = given if isinstance(given, Camera) else own if full_size else working_camera(own)
     sequence = Sequence(recording, used, config or SequenceConfig())
-    if used.width < own.width:
+    if used.reduced_by > 1:
         sizes = f"{own.width}x{own.height}, reduced to {used.width}x{used.height}"
         sequence.camera_source += f", images of {sizes}"
     _check_images(sequence)

@@ -17,7 +17,7 @@ from bmask_slam.live.sources.cameras.realsense_camera import RealSenseSource
 from bmask_slam.live.sources.cameras.record3d_camera import Record3dSource
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
 from bmask_slam.live.sources.ros2_source import Ros2Options, Ros2Source
-from bmask_slam.live.sources.source import Limited, RecordedSource, Reduced, Source
+from bmask_slam.live.sources.source import Limited, RecordedSource, Reduced, Source, Wrapped
 from bmask_slam.sequences.bags.bag_file import is_bag
 from bmask_slam.sequences.bags.sensors import SensorTopics
 from bmask_slam.sequences.bags.topics import BagTopics
@@ -100,7 +100,7 @@ def open_source(text: str, options: SourceOptions) -> Source:
 def ros2_of(source: Source) -> Ros2Source | None:
     """The source, also of a limited or reduced one, if it is ROS 2."""
     inner = source
-    while isinstance(inner, Limited | Reduced):
+    while isinstance(inner, Wrapped):
         inner = inner.source
     return inner if isinstance(inner, Ros2Source) else None
 

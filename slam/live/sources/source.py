@@ -144,35 +144,43 @@ class RecordedSource:
         """Nothing to release: each frame opens and closes its own files."""
 
 
-class Limited:
-    """The first ``max_frames`` frames of another ``source``."""
+class Wrapped:
+    """Another ``source``, of which something is changed."""
 
-    def __init__(self, source: Source, max_frames: int | None) -> None:
+    def __init__(self, source: Source) -> None:
         self.name, self.camera = source.name, source.camera
         self.groundtruth = source.groundtruth
         self.counts, self.waits = source.counts, source.waits
-        self.use = source.use
         self.pairs, self.interpolates = source.pairs, source.interpolates
-        self.source, self._max_frames = source, max_frames
+        self.source = source
 
-    def frames(self) -> Iterator[Frame]:
-        """Up to ``max_frames`` frames; all if that is None."""
-        return islice(self.source.frames(), self._max_frames)
+    def use(self, camera: Camera) -> None:
+        """Give later frames their depth by another camera."""
+        self.source.use(camera)
 
     def close(self) -> None:
         """Close the other source."""
         self.source.close()
 
 
-class Reduced:
+class Limited(Wrapped):
+    """The first ``max_frames`` frames of another ``source``; all if that is None."""
+
+    def __init__(self, source: Source, max_frames: int | None) -> None:
+        super().__init__(source)
+        self._max_frames = max_frames
+
+    def frames(self) -> Iterator[Frame]:
+        """Up to ``max_frames`` frames."""
+        return islice(self.source.frames(), self._max_frames)
+
+
+class Reduced(Wrapped):
     """Another ``source`` whose large images are reduced, as `images.working_camera` says."""
 
     def __init__(self, source: Source) -> None:
-        self.name, self.camera = source.name, working_camera(source.camera)
-        self.groundtruth = source.groundtruth
-        self.counts, self.waits = source.counts, source.waits
-        self.pairs, self.interpolates = source.pairs, source.interpolates
-        self.source = source
+        super().__init__(source)
+        self.camera = working_camera(source.camera)
 
     def use(self, camera: Camera) -> None:
         """Give later frames their depth by another camera, of the reduced images."""
@@ -186,10 +194,6 @@ class Reduced:
             depth_m = reduced_depth(frame.depth_m, k)
             depth_m[depth_m == 0] = np.nan
             yield replace(frame, rgb=reduced_colour(frame.rgb, k), depth_m=depth_m)
-
-    def close(self) -> None:
-        """Close the other source."""
-        self.source.close()
 
 
 def paced(frames: Iterator[Frame]) -> Iterator[Frame]:

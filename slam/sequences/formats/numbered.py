@@ -6,7 +6,6 @@ import logging
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -111,12 +110,3 @@ def possible(camera: Camera, where: str) -> Camera:
     if fault := camera.fault():
         raise InputError(f"{where}: a camera with {fault}; give --camera F")
     return camera
-
-
-def of_size(camera: Camera, width: int, height: int) -> Camera:
-    """The camera of the same view with an image of another size, without distortion."""
-    x, y = width / camera.width, height / camera.height
-    return replace(
-        camera, width=width, height=height, fx=x * camera.fx, fy=y * camera.fy,
-        cx=(camera.cx + 0.5) * x - 0.5, cy=(camera.cy + 0.5) * y - 0.5,
-    )  # fmt: skip

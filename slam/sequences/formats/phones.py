@@ -31,7 +31,6 @@ from bmask_slam.sequences.formats.numbered import (
     camera_of_matrix,
     image_list,
     numbered,
-    of_size,
     possible,
     trajectory_of,
 )
@@ -90,7 +89,7 @@ def open_r3d(path: Path, given: Given) -> Recording:
         "Record3D", path, sorted_list(path, stamps_s, files["jpg"]),
         sorted_list(path, stamps_s, files["depth"]), camera, source,
         trajectory_of(stamps_s[: len(poses)], poses, str(path)),
-        DepthForm(camera=of_size(own, said.dw, said.dh)),
+        DepthForm(camera=own.of_size(said.dw, said.dh)),
         images.colour, images.depth, images.exists,
     )  # fmt: skip
 
@@ -214,5 +213,5 @@ def open_polycam(folder: Path, given: Given) -> Recording:
     ]
     stored = decode_image(next(iter(depth.values())), cv2.IMREAD_UNCHANGED)
     truth = trajectory_of([number / _PER_SECOND for number in said], poses, str(cameras))
-    form = DepthForm(camera=of_size(own, stored.shape[1], stored.shape[0]))
+    form = DepthForm(camera=own.of_size(stored.shape[1], stored.shape[0]))
     return Recording("Polycam", folder, lists[0], lists[1], camera, source, truth, form)
