@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import betaln
 
 from bmask_slam.graph.arrays import Array, Floats, Ints
+from bmask_slam.semantics.beliefs.class_sizes import ANY, SUPPORT, TOP, ClassSizes
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,26 @@ class LabelStoreConfig:
         floor = np.float32(np.exp(-self.max_log_odds))
         likelihood = np.maximum(self.likelihoods(distributions, weights), floor)
         return np.float32(self.power) * np.log(likelihood)
+
+    def limited(
+        self, gained: Floats, distributions: Floats, log_p: Floats, sizes: ClassSizes
+    ) -> Floats:
+        """What masks of distributions (N, C) add to beliefs (N, C), of supports only so much.
+
+        Nothing is taken from what may lie on them. ``gained`` (N, C) is changed.
+        """
+        supports = sizes.is_in(SUPPORT)
+        labels = distributions[:, 1:].argmax(axis=1) + 1
+        rows = np.flatnonzero(supports[labels])
+        k = labels[rows]
+        over = log_p[rows, k] - log_p[rows, 0]
+        room = np.maximum(np.float32(self.support_log_odds) - over, 0)
+        own, nothing = gained[rows, k], gained[rows, 0]
+        small = np.flatnonzero(sizes.is_in(TOP, ANY))
+        at = np.ix_(rows, small)
+        gained[at] = np.maximum(gained[at], nothing[:, None])
+        gained[rows, k] = np.minimum(own, nothing + room)
+        return gained
 
     def log_missed(self, misses: Floats, recall: Array | None = None) -> Array:
         """log P(m misses (...) | a known class); m is the sum of the views' weights.

@@ -10,13 +10,16 @@ from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask
 from bmask_slam.graph.files.array_file import check_ids
-from bmask_slam.semantics.beliefs.class_sizes import ANY, SUPPORT, TOP
 from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig, in_turn
 from bmask_slam.semantics.beliefs.observation import GROUPS, ObservationModel, score_logits
 
 _MIN_CAPACITY = 1024
 _VIEWPOINTS = 64
-_TABLES = ("_log_p", "_views", "_misses", "_scores", "_seen", "_judged")
+_NAMED = 2.0
+"""Log likelihood by which a class that a mask named is above those that none did."""
+_NEWER = ("scores", "seen", "judged")
+"""Tables that states of older versions lack."""
+_TABLES = ("_log_p", "_views", "_misses", *(f"_{name}" for name in _NEWER))
 
 
 @dataclass(frozen=True)
@@ -105,10 +108,12 @@ class LabelStore:
         worth = weights * new
         scored = np.stack([worth * score_logits(distributions), worth], axis=1)
         np.add.at(self._scores, ids, scored)
-        limited = self.model is not None and not self._of_objects
+        sizes = None if self.model is None or self._of_objects else self.model.sizes
         for rows in in_turn(ids):
             at, part = ids[rows], gained[rows]
-            self._log_p[at] += self._limited(at, distributions[rows], part) if limited else part
+            if sizes is not None:
+                part = self.config.limited(part, distributions[rows], self._log_p[at], sizes)
+            self._log_p[at] += part
             self._bound(at)
 
     def move(self, from_ids: Ints, to_ids: Ints) -> None:
@@ -163,6 +168,12 @@ class LabelStore:
         right[at] = odds / (1 + odds)
         return self.model.truth(p, scores, right * self.model.on_thing(scores))
 
+    def named(self, ids: Ints) -> Mask:
+        """Which classes (N, C) masks named, of ids (N,) with views, and not too many denied."""
+        of_masks = self._log_p[ids, 1:]
+        above = of_masks > of_masks.min(axis=1, keepdims=True) + np.float32(_NAMED)
+        return np.pad(above, ((0, 0), (1, 0)))
+
     def evidence(self, ids: Ints) -> Array:
         """Number of views (N,) of any ids (N,) by their weights and whether they were new."""
         found, inside = np.zeros(len(ids)), ids < len(self._views)
@@ -205,13 +216,11 @@ class LabelStore:
             "log_p": self._log_p[ids].ravel(),
             "views": self._views[ids],
             "misses": self._misses[ids].ravel(),
-            "scores": self._scores[ids],
-            "seen": self._seen[ids],
-            "judged": self._judged[ids],
+            **{name: getattr(self, f"_{name}")[ids] for name in _NEWER},
         }
 
     def restore(self, state: Arrays) -> None:
-        """Replace the content by a state; those of older versions lack some arrays."""
+        """Replace the content by a state."""
         ids = state["ids"]
         check_ids(ids, int(ids.max(initial=-1)) + 1)
         self._clear()
@@ -222,9 +231,8 @@ class LabelStore:
             misses = state["misses"].reshape(len(ids), -1)
             fits = misses.shape[1] == self._misses.shape[1]
             self._misses[ids] = misses if fits else misses.mean(axis=1, keepdims=True)
-        self._scores[ids] = state.get("scores", np.zeros((len(ids), 2), np.float32))
-        self._seen[ids] = state.get("seen", np.zeros(len(ids), np.uint64))
-        self._judged[ids] = state.get("judged", np.zeros((len(ids), 2), np.float32))
+        for name in _NEWER:
+            getattr(self, f"_{name}")[ids] = state.get(name, 0)
         self._limit_misses(ids)
         self._resize(len(self))
 
@@ -244,25 +252,6 @@ class LabelStore:
         known |= again
         np.bitwise_or.at(self._seen, ids, bits)
         return np.where(known, np.float32(self.config.again), np.float32(1))
-
-    def _limited(self, ids: Ints, distributions: Floats, gained: Floats) -> Floats:
-        """What masks add (N, C) to ids (N,), of supports only so much.
-
-        Nothing is taken from what may lie on them.
-        """
-        assert self.model is not None
-        supports = self.model.sizes.is_in(SUPPORT)
-        labels = distributions[:, 1:].argmax(axis=1) + 1
-        rows = np.flatnonzero(supports[labels])
-        k = labels[rows]
-        over = self._log_p[ids[rows], k] - self._log_p[ids[rows], 0]
-        room = np.maximum(np.float32(self.config.support_log_odds) - over, 0)
-        own, nothing = gained[rows, k], gained[rows, 0]
-        small = np.flatnonzero(self.model.sizes.is_in(TOP, ANY))
-        at = np.ix_(rows, small)
-        gained[at] = np.maximum(gained[at], nothing[:, None])
-        gained[rows, k] = np.minimum(own, nothing + room)
-        return gained
 
     def _limit_misses(self, ids: Ints) -> None:
         self._misses[ids] = np.minimum(self._misses[ids], np.float32(self.config.recall_views))

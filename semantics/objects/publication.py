@@ -269,8 +269,7 @@ class ObjectPublisher:
         factors = size_and_place(o.box, ground, self._sizes, config)
         p = judged(o.distribution, factors)
         label = int(p.argmax())
-        looks = self._labels.appearance(np.array([o.id]))[0]
-        named = looks[label] > self._labels.config.prior(len(looks))[label]
+        named = self._labels.named(np.array([o.id]))[0, label]
         enough = self._labels.evidence(np.array([o.id]))[0] >= config.min_evidence
         sure = label > 0 and p[label] >= config.min_probability and stands_still(self._sizes)[label]
         reported = named and enough and sure

@@ -170,24 +170,24 @@ def test_landmarks_behind_a_thing_are_not_on_it() -> None:
 
 def test_an_object_has_a_name_that_masks_gave_it() -> None:
     """A flat box of 35 cm looks like a telephone, which a laptop does in three of ten cases."""
-    names = label_set(("cell phone", "laptop"))
-    confused = np.zeros((3, 3))
+    names = label_set(("cell phone", "laptop", "mouse"))
+    confused = np.zeros((4, 4))
     confused[1, 2] = 0.3
-    none = np.zeros(3)
+    none = np.zeros(4)
     model = ObservationModel(
         np.zeros(4), np.array([0.5, 0, 0]), np.zeros(2), np.zeros(4), none, none, none, none,
         confused, read_sizes(names),
     )  # fmt: skip
     corners = np.stack(np.meshgrid([0, 0.35], [0, 0.25], [0, 0.04], indexing="ij"), -1)
     room = corners.reshape(-1, 3) + np.array([1.0, 1.0, 0.75])
-    for named, expected in ((1, []), (2, [2])):
-        points, labels = ObjectPoints(), LabelStore(3, model=model, of_objects=True)
-        views = np.array([[0, 1, 0], [0, 1, 0], np.eye(3)[named]], np.float32)
+    for views, expected in (([1, 1, 1], []), ([1, 1, 2], [2]), ([2, 1, 1, 1], [2])):
+        points, labels = ObjectPoints(), LabelStore(4, model=model, of_objects=True)
         points.new_ids(1)
-        for k, view in enumerate(views):
-            labels.update(np.zeros(1, int), view[None], np.ones(1, np.float32), np.array([k]))
+        for k, view in enumerate(np.eye(4, dtype=np.float32)[views]):
+            score = np.full(1, 0.6, np.float32)
+            labels.update(np.zeros(1, int), view[None], score, np.array([k]))
             points.add(Sightings(k, float(k), np.zeros(1, int)), room, np.zeros(8, int))
         publisher = ObjectPublisher(points, labels, ObjectConfig(), read_sizes(names))
         ground = Ground(UP_ROOM, 0.0)
-        found = publisher.objects({k: np.eye(4) for k in range(3)}, ground)
+        found = publisher.objects({k: np.eye(4) for k in range(len(views))}, ground)
         assert [o.label for o in found] == expected
