@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.sparse import csr_array
 
@@ -17,5 +19,5 @@ class GroupSums:
 
     def __call__(self, rows: Array) -> Array:
         """Sums (count, ...) of the rows (M, ...)."""
-        sums = self._chosen @ rows.reshape(len(rows), -1)
-        return np.asarray(sums).reshape(-1, *rows.shape[1:])
+        sums = self._chosen @ rows.reshape(len(rows), math.prod(rows.shape[1:]))
+        return np.asarray(sums).reshape(len(sums), *rows.shape[1:])

@@ -12,8 +12,11 @@ seen and turned as the camera did; but neighbours are farther apart, and share f
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -27,6 +30,8 @@ from bmask_slam.graph.calibration.equations import CAUCHY, squared
 from bmask_slam.graph.calibration.model import PARAMETERS, CalibrationViews, residuals_of
 from bmask_slam.graph.calibration.problem import CalibrationProblem, CalibrationState
 
+Half = TypeVar("Half")
+Result = TypeVar("Result")
 MIN_KEYFRAMES = 5
 ALL = range(len(PARAMETERS))
 QUICK = CalibrationConfig(rounds=2, steps=4, tolerance=1e-3)
@@ -64,16 +69,23 @@ def cross_validate(
     first, second = halves_of(problem, alternately)
     if first is None or second is None:
         return None
-    found = [calibrate(half, QUICK) for half in (first, second)]
-    gains = [
-        _gains(judge, result, list(judged))
-        for judge, result in zip((second, first), found, strict=True)
-    ]
+    found = of_both(partial(calibrate, config=QUICK), (first, second))
+    judges = (second, found[0]), (first, found[1])
+    gains = of_both(lambda judge: _gains(*judge, list(judged)), judges)
     return CrossValidation(
         np.array([result.calibration for result in found]),
         np.array([np.sqrt(np.diag(result.covariance)) for result in found]),
         np.concatenate(gains),
     )
+
+
+def of_both(work: Callable[[Half], Result], halves: tuple[Half, Half]) -> list[Result]:
+    """What ``work`` makes of both halves, in two threads: most of it is numpy's arithmetic.
+
+    An exception of ``work`` is raised here.
+    """
+    with ThreadPoolExecutor(len(halves), "halves") as threads:
+        return list(threads.map(work, halves))
 
 
 def halves_of(

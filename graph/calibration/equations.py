@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import bsr_array
 
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.batch.group_sums import GroupSums
 from bmask_slam.graph.calibration.model import CalibrationViews, linearise
 from bmask_slam.graph.calibration.problem import CalibrationProblem, CalibrationState, N, add_priors
@@ -17,7 +17,10 @@ CAUCHY = 2.385  # 95 % efficiency on Gaussian noise
 
 @dataclass(frozen=True)
 class Reduced:
-    """Normal equations of poses and calibration, with what is needed to recover the points."""
+    """Normal equations of poses and calibration, with what is needed to recover the points.
+
+    ``cross_calibration`` (L, f, 3) is of the ``free`` (f,) parameters alone, by their places.
+    """
 
     S: Array
     b: Array
@@ -25,6 +28,7 @@ class Reduced:
     landmark_gradient: Array
     cross_pose: Array
     cross_calibration: Array
+    free: Ints
 
 
 def normal_equations(
@@ -32,11 +36,10 @@ def normal_equations(
 ) -> Reduced:
     """Schur complement of the weighted normal equations on poses (first) and calibration."""
     views, K, L = problem.views, len(state.poses), len(state.points)
-    lin = linearise(views, *state.values)
+    lin, free = linearise(views, *state.values), np.flatnonzero(problem.prior_sigmas > 0)
     root = root_weights(lin.residuals, scales)
-    r, J_c, J_l, J_k = (
-        lin.residuals * root[..., 0], lin.pose * root, lin.point * root, lin.calibration * root,
-    )  # fmt: skip
+    r, J_c, J_l = lin.residuals * root[..., 0], lin.pose * root, lin.point * root
+    J_k = lin.calibration[..., free] * root
     of_landmarks, of_keyframes = GroupSums(views.landmarks, L), GroupSums(views.keyframes, K)
     H_ll = of_landmarks(J_l.swapaxes(1, 2) @ J_l)
     g_l = of_landmarks(np.einsum("mri,mr->mi", J_l, r))
@@ -50,17 +53,18 @@ def normal_equations(
     known = np.einsum("mij,mj->mi", shrunk, g_l[views.landmarks])
     b_c = of_keyframes(np.einsum("mri,mr->mi", J_c, r) - known)
     shrunk_k = cross_k @ inverse_ll
-    flat = J_k.reshape(-1, N)
+    flat = J_k.reshape(3 * len(r), len(free))
     H_k = _damped(flat.T @ flat, damping)
-    S: Array = np.zeros((6 * K + N, 6 * K + N))
+    S, b = np.zeros((6 * K + N, 6 * K + N)), np.zeros(6 * K + N)
     S[:-N, :-N] = _block_diagonal(_damped(H_c, damping)) - _product(views, shrunk, cross_c, K, L)
-    S[:-N, -N:] = H_ck.reshape(6 * K, N)
-    S[-N:, :-N] = S[:-N, -N:].T
-    S[-N:, -N:] = H_k - np.einsum("lik,ljk->ij", shrunk_k, cross_k)
-    b_k = flat.T @ r.ravel() - np.einsum("lij,lj->i", shrunk_k, g_l)
-    b = np.concatenate([b_c.ravel(), b_k])
+    at = 6 * K + free
+    S[:-N, at] = H_ck.reshape(6 * K, len(free))
+    S[at, :-N] = S[:-N, at].T
+    S[np.ix_(at, at)] = H_k - np.einsum("lik,ljk->ij", shrunk_k, cross_k)
+    b[:-N] = b_c.ravel()
+    b[at] = flat.T @ r.ravel() - np.einsum("lij,lj->i", shrunk_k, g_l)
     add_priors(problem, state, S, b)
-    return Reduced(S, b, inverse_ll, g_l, cross_c, cross_k)
+    return Reduced(S, b, inverse_ll, g_l, cross_c, cross_k, free)
 
 
 def inverse_information(H: Array) -> Array:
@@ -99,7 +103,7 @@ def with_points(views: CalibrationViews, reduced: Reduced, x: Array) -> tuple[Ar
     Returns (K, 6, n), (L, 3, n) and (18, n).
     """
     poses, calibration = x[:-N].reshape(-1, 6, x.shape[1]), x[-N:]
-    right = reduced.cross_calibration.swapaxes(1, 2) @ calibration
+    right = reduced.cross_calibration.swapaxes(1, 2) @ calibration[reduced.free]
     from_poses = reduced.cross_pose.swapaxes(1, 2) @ poses[views.keyframes]
     np.add.at(right, views.landmarks, from_poses)
     return poses, -reduced.landmark_inverse @ right, calibration
