@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import csv
 import os
-import sys
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from io import TextIOWrapper
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.file_lock import lock_file
 from bmask_slam.graph.whole_file import whole_file
 
 
@@ -102,20 +102,6 @@ def _contents(file: IO[str]) -> str:
     file.flush()
     size = os.fstat(file.fileno()).st_size
     return os.pread(file.fileno(), size, 0).decode(errors="replace")
-
-
-def lock_file(file: IO[Any], folder: Path) -> None:
-    """Lock a file until it is closed. Raises InputError if another process holds the lock."""
-    if sys.platform == "win32":
-        return
-    import fcntl  # noqa: PLC0415 - Unix only
-
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise InputError(
-            f"{folder}: a process is writing a run there; wait for it, or choose another --out"
-        ) from error
 
 
 def check_grown(path: Path, columns: tuple[str, ...], size: int) -> None:

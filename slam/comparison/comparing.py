@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -33,6 +32,7 @@ from bmask_slam.comparison.jobs.plan import Plan, make_plan
 from bmask_slam.comparison.jobs.pool import LocalPool, Pool, RayPool
 from bmask_slam.comparison.report import write_report
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.file_lock import take_lock
 from bmask_slam.graph.whole_file import open_plain, writing
 
 logger = logging.getLogger(__name__)
@@ -201,14 +201,7 @@ def _locked(folder: Path) -> Iterator[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         file = open_plain(folder / ".lock", "w")
     with file:
-        if sys.platform != "win32":
-            import fcntl  # noqa: PLC0415 - Unix only
-
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise InputError(
-                    f"{folder}: another bmask-slam compare runs there; wait for it"
-                ) from error
+        if not take_lock(file):
+            raise InputError(f"{folder}: another bmask-slam compare runs there; wait for it")
         file.write(str(os.getpid()))
         yield folder

@@ -22,7 +22,7 @@ from bmask_slam.dense.saved_map import MappedRun, open_run, with_right_images
 from bmask_slam.dense.surface import FusedMap
 from bmask_slam.graph.arrays import Image, Mask
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.growing_table import lock_file
+from bmask_slam.graph.files.file_lock import lock_file
 from bmask_slam.graph.whole_file import remove
 from bmask_slam.labelling.awaited_masks import LAG
 from bmask_slam.labelling.semantic_mapper import SemanticMapper

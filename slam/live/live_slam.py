@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import tempfile
 import time
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
@@ -26,6 +25,7 @@ from bmask_slam.live.start import LiveOptions, start_system
 from bmask_slam.run_folder import metrics
 from bmask_slam.run_folder.folder import HEALTH, RunFolder
 from bmask_slam.run_folder.metrics import RunCounters, row
+from bmask_slam.runtime.scratch import scratch_folder
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
@@ -93,8 +93,7 @@ class LiveSlam(LiveMap):
         self._closed = False
         with ExitStack() as stack:  # closed in the opposite order
             self._recorder = self._open_recorder(stack)
-            scratch = tempfile.TemporaryDirectory(prefix="bmask-slam-", ignore_cleanup_errors=True)
-            folder = Path(stack.enter_context(scratch))
+            folder = stack.enter_context(scratch_folder())
             self._display = self._open_display(stack)
             system = start_system(camera, self.config, self.options, folder)
             self._system = stack.enter_context(closing(system))

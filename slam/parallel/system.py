@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from bmask_slam.live.messages import STATE_FILE
 from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.system import LiveSystem
 from bmask_slam.parallel.lockstep import LockstepMapper, LockstepSegmenter
+from bmask_slam.runtime.scratch import scratch_folder
 from bmask_slam.semantics.segmenters.segmenter_table import LabelsOnly, SegmenterOptions
 from bmask_slam.semantics.segmenters.upright import Upright
 from bmask_slam.sequences.frame import Frame
@@ -141,9 +142,8 @@ class ParallelSystems:
         """Start the segmenter, for the images of a sequence. Raises InputError if it cannot."""
         about = masks, sequence, upright
         self.segmenter = None if masks.name == "none" else LockstepSegmenter(*about)
-        self._scratch = tempfile.TemporaryDirectory(
-            prefix="bmask-slam-", ignore_cleanup_errors=True
-        )
+        self._scratch = ExitStack()
+        self._folder = self._scratch.enter_context(scratch_folder())
         self._last: ParallelSystem | None = None
 
     def __call__(self, camera: Camera, config: SystemConfig) -> ParallelSystem:
@@ -152,7 +152,7 @@ class ParallelSystems:
             self._last.remote.close()
         if self.segmenter is not None:
             self.segmenter.begin()
-        self._last = ParallelSystem(camera, config, self.segmenter, Path(self._scratch.name))
+        self._last = ParallelSystem(camera, config, self.segmenter, self._folder)
         return self._last
 
     def close(self) -> None:
@@ -161,4 +161,4 @@ class ParallelSystems:
             self._last.close()
         if self.segmenter is not None:
             self.segmenter.close()
-        self._scratch.cleanup()
+        self._scratch.close()

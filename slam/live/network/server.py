@@ -13,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from bmask_slam.graph.errors import InputError
@@ -22,6 +21,7 @@ from bmask_slam.live.network.carrying import CarriedFiles, Outbox
 from bmask_slam.live.network.connection import CODE_BYTES, Connection, Keys, admit
 from bmask_slam.live.processes.segmentation import serve_segmenter
 from bmask_slam.live.processes.worker import ONE_THREAD, run_first, safe_import_path
+from bmask_slam.runtime.scratch import scratch_folder
 
 logger = logging.getLogger(__name__)
 
@@ -151,10 +151,10 @@ def work(descriptor: int) -> None:
     end = socket.socket(fileno=descriptor)
     connection = Connection(end, Keys(data[:CODE_BYTES], data[CODE_BYTES:]))
     channel = Channel(connection, None, Outbox())
-    with TemporaryDirectory(prefix="bmask-slam-", ignore_cleanup_errors=True) as folder:
+    with scratch_folder() as folder:
 
         def run(first: tuple[str, tuple[Any, ...], Any]) -> None:
-            _run(channel, Path(folder), *first)
+            _run(channel, folder, *first)
 
         run_first(channel, run)
 

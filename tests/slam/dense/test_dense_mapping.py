@@ -29,7 +29,7 @@ from bmask_slam.dense.surface import FusedMap, make_surface
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested, read_arrays, write_arrays
-from bmask_slam.graph.files.growing_table import lock_file
+from bmask_slam.graph.files.file_lock import lock_file
 from bmask_slam.graph.files.ply import read_ply, write_ply
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.trajectory import Trajectory, write_tum
