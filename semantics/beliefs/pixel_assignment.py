@@ -132,10 +132,9 @@ def _surfaces(
 
 def grouped_median(values: Array, groups: Ints, count: int) -> Array:
     """The upper median (count,) of the values (N,) of each group (N,); NaN for an empty one."""
-    order = np.lexsort((values, groups))
-    sizes = np.bincount(groups, minlength=count)
-    middle = np.cumsum(sizes) - sizes + sizes // 2
-    found = np.full(count, np.nan)
-    some = sizes > 0
-    found[some] = values[order][middle[some]]
+    order = np.argsort(groups.astype(np.int16), kind="stable")  # radix sort
+    sizes, found = np.bincount(groups, minlength=count), np.full(count, np.nan)
+    parts = np.split(values[order], np.cumsum(sizes)[:-1])
+    for k in np.flatnonzero(sizes).tolist():
+        found[k] = np.partition(parts[k], sizes[k] // 2)[sizes[k] // 2]
     return found

@@ -92,8 +92,11 @@ class LabelVotes:
         for keyframe_id, row in self._remembered.rows.items():
             if (seen := observed_by(keyframe_id, self._map)) is None:
                 continue
-            located = seen.among(new).located(world)
-            poses[row], segments[row] = located.T_world_camera, located.segment
+            poses[row], segments[row] = seen.T_world_camera, seen.anchor.segment
+            seen = seen.among(new)
+            if not len(seen.landmark_ids):
+                continue
+            located = seen.located(world)
             of_row = np.full(len(located.landmark_ids), row)
             matched.append(Sightings(of_row, located.landmark_ids, located.pixels, located.z_m))
         known = Sightings.joined(matched)

@@ -16,6 +16,7 @@ from bmask_slam.live.processes.segmentation import MAX_KEPT, Queueing, RemoteSeg
 from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.runtime.machine import available_cores
 from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import Segmenter, check_image
 from bmask_slam.semantics.segmenters.segmenter_table import (
     SegmenterOptions,
@@ -24,6 +25,7 @@ from bmask_slam.semantics.segmenters.segmenter_table import (
     needed_by,
 )
 from bmask_slam.semantics.segmenters.upright import Upright
+from bmask_slam.semantics.tracks.instance_tracks import load_filters
 
 ANSWER_S = 600.0
 """Longest time for an image: a large network on an old processor takes a minute."""
@@ -49,6 +51,10 @@ class SegmenterBeside(RemoteSegmenter):
         self._begun: dict[str, int] = {}
         self._found: dict[int, list[Instance]] = {}
         self._reasons: dict[int, str] = {}
+
+    def _known_labels(self, options: SegmenterOptions, sequence: Path) -> LabelSet:
+        load_filters()  # while the process loads its network
+        return super()._known_labels(options, sequence)
 
     def begin(self, image: Image, name: str) -> None:
         """Begin with an image whose instances will be asked for later; returns at once."""
