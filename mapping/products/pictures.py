@@ -48,8 +48,8 @@ def nearest_points(
     ahead = ahead[np.argsort(-points[ahead, 2], kind="stable")]  # the nearest last
     z, pixels = points[ahead, 2], np.rint(camera.project(points[ahead])).astype(np.int64)
     half = np.clip(np.ceil(point_m * camera.fx / z), 1, MAX_SIZE_PX).astype(np.int64) // 2
-    order = np.full(camera.height * camera.width, -1)
-    for dy, dx in product(range(-(MAX_SIZE_PX // 2), MAX_SIZE_PX // 2 + 1), repeat=2):
+    order, reach = np.full(camera.height * camera.width, -1), int(half.max(initial=0))
+    for dy, dx in product(range(-reach, reach + 1), repeat=2):
         u, v = pixels[:, 0] + dx, pixels[:, 1] + dy
         inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         rows = np.flatnonzero(inside & (half >= max(abs(dy), abs(dx))))
