@@ -8,7 +8,7 @@ from typing import Any
 from benchmarks.pages import table
 from benchmarks.suite.anchors import KITCHEN, PUBLISHED_ATE_CM
 from benchmarks.suite.targets import target_rows
-from bmask_slam.evaluation import format_table
+from bmask_slam.commands.arguments import format_summary
 
 Results = dict[str, Any]
 EXAMPLE_BEGIN = "<!-- example: written by benchmarks/run.py -->"
@@ -76,7 +76,7 @@ def _drift(run: dict[str, Any]) -> str:
 def example_block(results: Results) -> str:
     """What the command line prints of the office's run, between its markers."""
     run = next(run for run in results["runs"] if run["sequence"] == "office")
-    printed = format_table(run["printed"])
+    printed = format_summary(run["printed"])
     return f"{EXAMPLE_BEGIN}\n```\n$ {run['command']}\n{printed}\n```\n{EXAMPLE_END}"
 
 
