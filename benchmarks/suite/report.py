@@ -159,9 +159,10 @@ def _kitchen(results: Results) -> str:
     return (
         f"## Beside other systems: red kitchen, first 600 frames\n\n{table(header, rows)}\n\n"
         "The others were measured once for this project, on another machine with two cores, with "
-        "the same calibration (benchmarks/suite/anchors.py); their time is of a whole frame. Beside "
-        "ORB-SLAM3 on one machine: [real cameras](real-cameras.md). The reference is itself an estimate (KinectFusion), good to 1-2 cm, and so is the calibration: a depth "
-        "scale 2 % larger takes ORB-SLAM2 from 4.8 to 4.0 cm. It also moves like a point beside "
+        "the same calibration (benchmarks/suite/anchors.py); their time is of a whole frame. "
+        "Beside ORB-SLAM3 on one machine: [real cameras](real-cameras.md). The reference is itself "
+        "an estimate (KinectFusion), good to 1-2 cm, and so is the calibration: a depth scale 2 % "
+        "larger takes ORB-SLAM2 from 4.8 to 4.0 cm. It also moves like a point beside "
         "the camera, which is not taken into account here (see [graph.md](graph.md)). Differences "
         "below a centimetre prove nothing; the rendered sequences, whose truth is exact, decide."
     )
