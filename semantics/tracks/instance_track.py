@@ -64,3 +64,9 @@ class Track:
     def moving(self) -> bool:
         """Whether it is more likely moving than not."""
         return self.prior + self.evidence > 0
+
+
+def load_filters() -> None:
+    """Load filterpy before it is needed: it takes most of a second, as it loads scipy.stats."""
+    import filterpy.common  # noqa: PLC0415
+    import filterpy.kalman  # noqa: F401, PLC0415

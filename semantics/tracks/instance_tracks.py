@@ -14,12 +14,6 @@ _H = np.eye(3, 6)
 _NEVER = 1e9
 
 
-def load_filters() -> None:
-    """Load filterpy before it is needed: it takes most of a second, as it loads scipy.stats."""
-    import filterpy.common  # noqa: PLC0415
-    import filterpy.kalman  # noqa: F401, PLC0415
-
-
 @dataclass(frozen=True)
 class TrackConfig:
     """The motion model, the association, and when a track ends.

@@ -25,7 +25,7 @@ from bmask_slam.semantics.segmenters.segmenter_table import (
     needed_by,
 )
 from bmask_slam.semantics.segmenters.upright import Upright
-from bmask_slam.semantics.tracks.instance_tracks import load_filters
+from bmask_slam.semantics.tracks.instance_track import load_filters
 
 ANSWER_S = 600.0
 """Longest time for an image: a large network on an old processor takes a minute."""
