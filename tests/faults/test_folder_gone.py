@@ -196,4 +196,4 @@ def test_a_live_run_whose_folder_cannot_be_made_again(tmp_path: Path) -> None:
             slam.close()
     path = Path(str(caught.value).rsplit(" ", 1)[1])
     assert len(read_tum(path)) == 6
-    os.unlink(path)
+    shutil.rmtree(path.parent)

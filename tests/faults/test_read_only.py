@@ -73,5 +73,5 @@ def test_a_live_run_tracks_on_and_saves_the_trajectory_elsewhere(disk) -> None:
             slam.close()
     elsewhere = Path(str(caught.value).rsplit(" ", 1)[1])
     assert len(read_tum(elsewhere)) == len(FRAMES)
-    elsewhere.unlink()
+    shutil.rmtree(elsewhere.parent)
     assert not running(pids)
