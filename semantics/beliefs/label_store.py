@@ -16,7 +16,7 @@ from bmask_slam.semantics.beliefs.observation import GROUPS, ObservationModel, s
 _MIN_CAPACITY = 1024
 _VIEWPOINTS = 64
 _NAMED = 2.0
-"""Log likelihood by which a class that a mask named is above those that none did."""
+"""Log likelihood by which a class that a mask named is above what none named."""
 _NEWER = ("scores", "seen", "judged")
 """Tables that states of older versions lack."""
 _TABLES = ("_log_p", "_views", "_misses", *(f"_{name}" for name in _NEWER))
@@ -169,10 +169,14 @@ class LabelStore:
         return self.model.truth(p, scores, right * self.model.on_thing(scores))
 
     def named(self, ids: Ints) -> Mask:
-        """Which classes (N, C) masks named, of ids (N,) with views, and not too many denied."""
-        of_masks = self._log_p[ids, 1:]
-        above = of_masks > of_masks.min(axis=1, keepdims=True) + np.float32(_NAMED)
-        return np.pad(above, ((0, 0), (1, 0)))
+        """Whether masks named each class (N, C), of ids (N,) that have views.
+
+        One that others outvoted by nearly ``max_log_odds`` is forgotten.
+        """
+        log_p = self._log_p[ids]
+        found: Mask = log_p > log_p.min(axis=1, keepdims=True) + np.float32(_NAMED)
+        found[:, 0] = False
+        return found
 
     def evidence(self, ids: Ints) -> Array:
         """Number of views (N,) of any ids (N,) by their weights and whether they were new."""

@@ -26,15 +26,15 @@ OVERVIEW_OFFSET_M = np.array([0.0, -0.6, -1.0])
 OVERVIEW_TILT_DEG = -20.0
 """The overview is taken from behind and above a keyframe, tilted down."""
 OVERVIEWS, OVERVIEW_STEP, OVERVIEW_POINTS, FAR_M = 24, 16, 100_000, 6.0
-"""Of so many keyframes the best is taken, by pictures of a sixteenth of the size, of so many points
-of the cloud, in which what is farther counts as if it were so far."""
+"""The overview is chosen among so many keyframes, by pictures of a sixteenth of the size with so
+many points of the cloud; distances above FAR_M count as FAR_M."""
 LEGEND_SHARE = 0.002
 """A legend has the labels on at least so much of what a picture shows."""
 VIEWS = ("first", "middle", "overview")
 
 
 def write_views(fused: FusedMap, cloud: Cloud, names: tuple[str, ...]) -> list[Path]:
-    """Write view_NAME.png, and view_NAME_semantic.png if there are several labels."""
+    """Write view_NAME.png, and view_NAME_semantic.png if there are labels."""
     folder, written, colours = fused.folder.path, [], palette(names)
     camera, poses = _upright(fused)
     chosen = poses[0], poses[len(poses) // 2], overview(cloud, camera, poses)

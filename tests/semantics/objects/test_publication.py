@@ -13,7 +13,7 @@ from bmask_slam.graph.geometry import se3_exp, transform
 from bmask_slam.semantics.beliefs.class_sizes import read_sizes
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.observation import ObservationModel
-from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.labels import LabelSet, label_set
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
 from bmask_slam.semantics.objects.config import ObjectConfig, PublicationConfig
 from bmask_slam.semantics.objects.gravity import GravityEstimator
@@ -168,26 +168,38 @@ def test_landmarks_behind_a_thing_are_not_on_it() -> None:
     assert kept.tolist() == [0, 1]  # the second is 9 cm outside, the third 1.75 m behind
 
 
-def test_an_object_has_a_name_that_masks_gave_it() -> None:
-    """A flat box of 35 cm looks like a telephone, which a laptop does in three of ten cases."""
-    names = label_set(("cell phone", "laptop", "mouse"))
-    confused = np.zeros((4, 4))
+def reported_labels(names: LabelSet, views: list[int], score: float) -> list[int]:
+    """Labels of what is reported of a flat box of 35 cm, called so in views of such a score.
+
+    It looks like a telephone, which a laptop does in three of ten cases.
+    """
+    count = len(names)
+    confused, none = np.zeros((count, count)), np.zeros(count)
     confused[1, 2] = 0.3
-    none = np.zeros(4)
     model = ObservationModel(
         np.zeros(4), np.array([0.5, 0, 0]), np.zeros(2), np.zeros(4), none, none, none, none,
         confused, read_sizes(names),
     )  # fmt: skip
     corners = np.stack(np.meshgrid([0, 0.35], [0, 0.25], [0, 0.04], indexing="ij"), -1)
     room = corners.reshape(-1, 3) + np.array([1.0, 1.0, 0.75])
+    points, labels = ObjectPoints(), LabelStore(count, model=model, of_objects=True)
+    points.new_ids(1)
+    for k, view in enumerate(np.eye(count, dtype=np.float32)[views]):
+        scores = np.full(1, score, np.float32)
+        labels.update(np.zeros(1, int), view[None], scores, np.array([k]))
+        points.add(Sightings(k, float(k), np.zeros(1, int)), room, np.zeros(8, int))
+    publisher = ObjectPublisher(points, labels, ObjectConfig(), read_sizes(names))
+    ground = Ground(UP_ROOM, 0.0)
+    return [o.label for o in publisher.objects({k: np.eye(4) for k in range(len(views))}, ground)]
+
+
+def test_an_object_has_a_name_that_masks_gave_it() -> None:
+    names = label_set(("cell phone", "laptop"))
+    for named, expected in ((1, []), (2, [2])):
+        assert reported_labels(names, [1, 1, named], 1.0) == expected
+
+
+def test_a_name_counts_where_others_outvoted_it() -> None:
+    names = label_set(("cell phone", "laptop", "mouse"))
     for views, expected in (([1, 1, 1], []), ([1, 1, 2], [2]), ([2, 1, 1, 1], [2])):
-        points, labels = ObjectPoints(), LabelStore(4, model=model, of_objects=True)
-        points.new_ids(1)
-        for k, view in enumerate(np.eye(4, dtype=np.float32)[views]):
-            score = np.full(1, 0.6, np.float32)
-            labels.update(np.zeros(1, int), view[None], score, np.array([k]))
-            points.add(Sightings(k, float(k), np.zeros(1, int)), room, np.zeros(8, int))
-        publisher = ObjectPublisher(points, labels, ObjectConfig(), read_sizes(names))
-        ground = Ground(UP_ROOM, 0.0)
-        found = publisher.objects({k: np.eye(4) for k in range(len(views))}, ground)
-        assert [o.label for o in found] == expected
+        assert reported_labels(names, views, 0.6) == expected
