@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
 
 from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.geometry import make_pose
-from bmask_slam.graph.pose_graph.pose_graph import PoseGraph
+from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, complex_rotations, planar_poses
 
 LEAST_WEIGHT = 1e-6  # of the median: a graph stays connected by edges of almost no information
 _SYMMETRIC = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
@@ -24,15 +26,22 @@ def chordal_poses(graph: PoseGraph) -> Array:
     for nine unknowns a pose together, where the three rows of a rotation have the same equations:
     it takes five times as long and starts at up to a thousand times the cost.
     """
-    d = 2 if graph.is_planar else 3
-    known, turn = _known(graph), slice(2, 3) if d == 2 else slice(0, 3)
-    R_ij = graph.measurements[:, :d, :d]
-    weights = mean_information(graph.information[:, turn, turn])
-    given = np.swapaxes(graph.poses[:, :d, :d], 1, 2)
-    transposed = _solve(graph, weights, np.swapaxes(R_ij, 1, 2), known, given, 0.0 * given)
+    if graph.is_planar:
+        return poses_of_rotations(graph, _planar_rotations(graph))
+    weights = mean_information(graph.information[:, :3, :3])
+    R_ij, given, known = graph.measurements[:, :3, :3], graph.poses[:, :3, :3], _known(graph)
+    transposed = _solve(graph, weights, np.swapaxes(R_ij, 1, 2), np.swapaxes(given, 1, 2))
     R = _nearest_rotations(np.swapaxes(transposed, 1, 2))
-    R[known] = graph.poses[known, :d, :d]
+    R[known] = given[known]
     return poses_of_rotations(graph, R)
+
+
+def _planar_rotations(graph: PoseGraph) -> Array:
+    """(N, 2, 2): in the plane a rotation is a complex number of length 1, so is its relaxation."""
+    weights = mean_information(graph.information[:, 2:, 2:])
+    given, links = complex_rotations(graph.poses), complex_rotations(graph.measurements)
+    z = _solve(graph, weights, links[:, None, None], given[:, None, None])[:, 0, 0]
+    return planar_poses(np.angle(z)[:, None] * [0.0, 0.0, 1.0])[:, :2, :2]
 
 
 def poses_of_rotations(graph: PoseGraph, R: Array) -> Array:
@@ -49,9 +58,8 @@ def poses_of_rotations(graph: PoseGraph, R: Array) -> Array:
     np.add.at(pulls, i, -steps)
     T = make_pose(np.eye(3), graph.poses[:, :3, 3])
     T[:, :d, :d] = R
-    T[:, :d, 3] = _solve(
-        graph, weights, np.ones((len(i), 1, 1)), _known(graph), T[:, None, :d, 3], pulls
-    )[:, 0]
+    ones = np.ones((len(i), 1, 1))
+    T[:, :d, 3] = _solve(graph, weights, ones, T[:, None, :d, 3], pulls)[:, 0]
     return T
 
 
@@ -67,31 +75,30 @@ def mean_information(information: Array) -> Array:
 
 
 def _solve(
-    graph: PoseGraph, weights: Array, links: Array, known: Mask, given: Array, pulls: Array
-) -> Array:
-    """X (N, k, c) minimising ``sum w |X_j - B X_i|^2 - 2 pulls X`` for orthogonal B (M, k, k)."""
+    graph: PoseGraph, weights: Array, links: Any, given: Any, pulls: Array | None = None
+) -> Any:
+    """X (N, k, c) minimising ``sum w |X_j - B X_i|^2 - 2 pulls X`` for unitary B (M, k, k).
+
+    Fixed vertices keep what is given (N, k, c).
+    """
     (i, j), (n, k) = graph.edges.T, given.shape[:2]
-    span = np.arange(k)
-    weighted = weights[:, None, None] * links
+    span, diagonal = np.arange(k), np.arange(n * k)
+    entries = (-weights[:, None, None] * links).ravel()
     rows = (j[:, None, None] * k + span[:, None] + 0 * span).ravel()
     columns = (i[:, None, None] * k + 0 * span[:, None] + span).ravel()
     degrees = np.bincount(i, weights, n) + np.bincount(j, weights, n)
-    entries = -weighted.ravel()
-    diagonal = np.arange(n * k)
-    H = csc_array(
-        coo_array(
-            (
-                np.concatenate([entries, entries, np.repeat(degrees, k)]),
-                (np.r_[rows, columns, diagonal], np.r_[columns, rows, diagonal]),
-            ),
-            shape=(n * k, n * k),
-        )
-    )
-    free, X = np.repeat(~known, k), given.reshape(n * k, -1).copy()
-    if free.any():
-        right = pulls.reshape(n * k, -1)[free] - H[free][:, ~free] @ X[~free]
-        factor = splu(csc_array(H[free][:, free]), permc_spec="MMD_AT_PLUS_A", **_SYMMETRIC)
-        X[free] = factor.solve(right)
+    entries = np.concatenate([entries, entries.conj(), np.repeat(degrees, k)])
+    rows, columns = np.r_[rows, columns, diagonal], np.r_[columns, rows, diagonal]
+    free, X = np.repeat(~_known(graph), k), given.reshape(n * k, -1).copy()
+    if not free.any():
+        return X.reshape(given.shape)
+    right = np.zeros(X.shape, X.dtype) if pulls is None else pulls.reshape(X.shape).copy()
+    at_known = ~free[columns]
+    np.subtract.at(right, rows[at_known], entries[at_known, None] * X[columns[at_known]])
+    inside, place = free[rows] & ~at_known, np.cumsum(free) - 1
+    cells = (place[rows[inside]], place[columns[inside]])
+    H = csc_array(coo_array((entries[inside], cells), shape=2 * (int(free.sum()),)))
+    X[free] = splu(H, permc_spec="MMD_AT_PLUS_A", **_SYMMETRIC).solve(right[free])
     return X.reshape(given.shape)
 
 

@@ -9,9 +9,12 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, make_pose, se3_log
-from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, planar_coordinates, planar_poses
-
-_PLANAR = [3, 4, 2]  # x, y and angle in a tangent of SE(3)
+from bmask_slam.graph.pose_graph.pose_graph import (
+    PoseGraph,
+    complex_rotations,
+    planar_coordinates,
+    planar_poses,
+)
 
 
 def edge_chi_squares(graph: PoseGraph, poses: Array | None = None) -> Array:
@@ -20,11 +23,25 @@ def edge_chi_squares(graph: PoseGraph, poses: Array | None = None) -> Array:
     ``r = log(inverse(measurement) @ inverse(T_world_i) @ T_world_j)``, as GTSAM has it.
     """
     T = graph.poses if poses is None else poses
-    i, j = graph.edges.T
-    r = se3_log(inverse(T[i] @ graph.measurements) @ T[j])
     if graph.is_planar:
-        r = r[:, _PLANAR]
+        r = _planar_residuals(graph, T)
+    else:
+        i, j = graph.edges.T
+        r = se3_log(inverse(T[i] @ graph.measurements) @ T[j])
     return np.asarray(np.einsum("mi,mij,mj->m", r, graph.information, r, optimize=True))
+
+
+def _planar_residuals(graph: PoseGraph, T: Array) -> Array:
+    """(M, 3) x, y and angle: the logarithm in SE(2), rotations and positions as complex numbers."""
+    i, j = graph.edges.T
+    q, p = complex_rotations(T), T[:, 0, 3] + 1j * T[:, 1, 3]
+    Z = graph.measurements
+    back = np.conj(q[i] * complex_rotations(Z))
+    angle_rad = np.angle(back * q[j])
+    half = 0.5 * angle_rad
+    scale = np.cos(half) / np.sinc(half / np.pi) - 1j * half  # of V(angle), inverted
+    t = scale * back * (p[j] - p[i] - q[i] * (Z[:, 0, 3] + 1j * Z[:, 1, 3]))
+    return np.stack([t.real, t.imag, angle_rad], axis=1)
 
 
 def pose_graph_cost(graph: PoseGraph) -> float:
@@ -68,8 +85,9 @@ def _gtsam_poses(graph: PoseGraph, T: Array) -> list[Any]:
 
 def make_values(graph: PoseGraph, poses: Array) -> gtsam.Values:
     values = gtsam.Values()
+    kind = "pose2" if graph.is_planar else "pose3"  # names the overload: half the time
     for k, pose in enumerate(_gtsam_poses(graph, poses)):
-        values.insert(k, pose)
+        values.insert(k, **{kind: pose})
     return values
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
@@ -104,6 +105,11 @@ def planar_coordinates(T: Array) -> Array:
     """(..., 3) x m, y m and angle rad in (-pi, pi] of transforms (..., 4, 4) in the plane."""
     angle_rad = np.arctan2(T[..., 1, 0], T[..., 0, 0])
     return np.concatenate([T[..., :2, 3], angle_rad[..., None]], axis=-1)
+
+
+def complex_rotations(T: Array) -> NDArray[np.complex128]:
+    """``exp(1j * angle)`` (N,) of transforms (N, 4, 4) in the plane."""
+    return np.asarray(T[:, 0, 0] + 1j * T[:, 1, 0])
 
 
 def component_labels(graph: PoseGraph) -> Ints:

@@ -26,11 +26,15 @@ ROUNDING = 1e-9  # of the cost: a step that raises it by less did not raise it
 
 @dataclass(frozen=True)
 class PoseGraphConfig:
-    """Limits of the iterations, and the parameters of GNC."""
+    """Limits of the iterations, and the parameters of GNC.
+
+    ``relative_tolerance`` is GTSAM's default, of all that is left to gain and not of the last step
+    alone.
+    """
 
     method: Method = "lm"
     max_iterations: int = 200
-    relative_tolerance: float = 1e-7
+    relative_tolerance: float = 1e-5
     inlier_probability: float = 0.999
     gnc_step: float = 1.4
     gnc_inner_iterations: int = 3
@@ -118,6 +122,8 @@ class PoseGraphSolver:
         that is the method): a graph's weakest directions, a long path that closes late, are often
         far weaker than Levenberg-Marquardt's first damping, which then takes several steps.
         """
+        if before is not None and before.converged:
+            return before
         undamped = self._config.method != "dogleg"
         optimiser = self._optimiser(undamped)
         descent = before or Descent(float(optimiser.error()))
