@@ -144,12 +144,18 @@ class SensorSystem(SystemResults, SensorInput):
     def leave_out(self, camera: Camera) -> None:
         """Find nothing more in what this camera says is covered; nothing else may differ in it.
 
-        The next keyframe begins a segment. The map of before may have been bent by what is covered,
-        so its landmarks leave the graph, and nothing is recognised by them.
+        The map of before may have been bent by what is covered, so it begins anew.
         """
         self.camera = self.camera_tracker.tracker.camera = camera
         self.extractor.leave_out(camera)
         self.moving_objects.leave_out(camera)
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """Begin a segment with the next keyframe, apart from a map that is bent.
+
+        Its landmarks leave the graph, and nothing is recognised by them.
+        """
         self.map.prune_landmarks(np.flatnonzero(self.map.world.landmarks.in_map))
         self.camera_tracker.reset(0)
         self.camera_tracker.begin_apart()

@@ -23,7 +23,6 @@ from bmask_slam.runtime.stage_clock import stage
 from bmask_slam.semantics.segmenters.segmenter import Segmenter, begin_early
 from bmask_slam.sequences.frame import Frame, check_frame
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.system_results import largest
 from bmask_slam.system_state import SavedSystem
 from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.keyframe_decision import KeyframeDecision
@@ -141,7 +140,7 @@ class SlamSystem(SavedSystem):
             self._adjust_frames()
         if self.config.smooth_trajectory:
             self.map.history.smooth(self.map.world)
-        known = self.map.world.in_segment(largest(self.segments()))
+        known = self.map.world.in_segment(self.largest_segment())
         if self._first_keyframe and known and known[0].id >= self._first_keyframe:
             logger.warning(
                 "no frame was recognised in the map: the trajectory has its own coordinate frame"

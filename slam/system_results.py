@@ -83,11 +83,19 @@ class SystemResults(ABC):
         """Every frame with a pose in the largest segment, from the keyframes as they are now."""
         nothing = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
         segments = self.segments()
-        return segments.get(largest(segments), nothing)
+        return segments.get(self._largest(segments), nothing)
 
     def segments(self) -> dict[int, Trajectory]:
         """The frames of every map segment, each in the segment's own coordinate frame."""
         return self.map.history.trajectories(self.map.world)
+
+    def largest_segment(self) -> int:
+        """The segment with most frames, of those with landmarks if any; the older of equal ones."""
+        return self._largest(self.segments())
+
+    def _largest(self, segments: dict[int, Trajectory]) -> int:
+        mapped = self.map.world.mapped_segments()
+        return max(segments, key=lambda s: (s in mapped, len(segments[s]), -s), default=0)
 
     def keyframe_trajectory(self) -> Trajectory:
         """The keyframes of the largest segment that this session made.
@@ -95,7 +103,7 @@ class SystemResults(ABC):
         In a merged map those of recordings that a run had continued have no stamp, and are left
         out.
         """
-        chosen = self.map.world.in_segment(largest(self.segments()))
+        chosen = self.map.world.in_segment(self.largest_segment())
         chosen = [k for k in chosen if k.id >= self._first_keyframe]
         chosen = [k for k in chosen if np.isfinite(k.timestamp_s)]
         poses = np.array([k.T_world_camera for k in chosen]).reshape(-1, 4, 4)
@@ -103,14 +111,14 @@ class SystemResults(ABC):
 
     def keyframe_covariances(self) -> KeyframeCovariances:
         """Covariances of the keyframes of the largest segment that have a stamp."""
-        chosen = self.map.world.in_segment(largest(self.segments()))
+        chosen = self.map.world.in_segment(self.largest_segment())
         stamps_s = {k.id: k.timestamp_s for k in chosen if np.isfinite(k.timestamp_s)}
         return find_covariances(self.mapper.smoother, stamps_s)
 
     def landmarks(self) -> LandmarkCloud:
         """The landmarks of the largest segment, with their colours."""
         table = self.map.world.landmarks
-        chosen = self.map.world.in_segment(largest(self.segments()))
+        chosen = self.map.world.in_segment(self.largest_segment())
         hosts = [k.id for k in chosen]
         ids = np.flatnonzero(table.in_map & np.isin(table.host, hosts))
         labels = self.semantics.landmark_labels(ids, chosen)
@@ -119,11 +127,11 @@ class SystemResults(ABC):
 
     def objects(self) -> MapObjects:
         """The objects of the largest segment."""
-        return self.semantics.map_objects(self.map.world.in_segment(largest(self.segments())))
+        return self.semantics.map_objects(self.map.world.in_segment(self.largest_segment()))
 
     def markers_found(self) -> MarkerMap:
         """The fiducial markers of the largest segment."""
-        chosen, mapper = largest(self.segments()), self.mapper
+        chosen, mapper = self.largest_segment(), self.mapper
         return mapper.sensors.marker_map(mapper.smoother.tables, chosen)
 
     def files(self) -> dict[str, Callable[[Path], None]]:
@@ -168,11 +176,6 @@ class SystemResults(ABC):
             "isam2_update_ms": list(self.mapper.update_ms),
             "graph": totals(self.mapper.events.counts),
         }
-
-
-def largest(segments: dict[int, Trajectory]) -> int:
-    """The segment with most frames, the older of equal ones; 0 where there is none."""
-    return max(segments, key=lambda s: (len(segments[s]), -s), default=0)
 
 
 def checked_state(state: Arrays, own: Arrays, path: Path) -> Arrays:

@@ -1,15 +1,18 @@
 """What a run makes of a wrong camera: faults put into recordings, and what it finds or warns of.
 
     python -m benchmarks.suite.wrong_cameras [--into DIR] [--only NAME ...] [--faults NAME ...]
+        [--live]
 
 Faulty copies of the recordings under ../shared/data and a rendered office are made in ``--into``
 and run by default options; images that stay as they are are linked. Nothing of them belongs into
-the repository.
+the repository. ``--live``: by `live`, as fast as it tracks, the whole recordings; the ATE is that
+of the largest map segment, of which the number of frames is printed.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -23,10 +26,12 @@ from numpy.typing import NDArray
 
 from benchmarks.pages import table
 from benchmarks.paths import SHARED
+from benchmarks.suite.measure import call
 from bmask_slam.graph.camera import Camera
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.rendering.config import RenderConfig
 from bmask_slam.rendering.sequence import render_sequence
+from bmask_slam.run_folder.reader import Run
 from bmask_slam.sequences.cameras import read_camera, write_camera
 
 NAMES = ("tum_fr1_rpy", "bonn_crowd", "redkitchen", "office")
@@ -129,12 +134,24 @@ def outcome(folder: Path, out: Path) -> tuple[str, str]:
     return "; ".join(said) or "-", f"{1e3 * rows['ate_rmse']:.1f}"
 
 
-def rows_of(source: Path, faults: Sequence[str], into: Path) -> Iterator[tuple[str, ...]]:
+def live_outcome(folder: Path, out: Path) -> tuple[str, str]:
+    """What `live` found of the camera, and its ATE in mm with the number of frames."""
+    told = json.loads(
+        call(["-m", "bmask_slam", "live", str(folder), "--out", str(out), "--quiet", "--json"])
+    )
+    rows = {row["name"]: row["value"] for row in told["metrics"]}
+    frames = len(Run(out).trajectory)
+    return told["calibration"] or "-", f"{1e3 * rows['ate_rmse']:.1f} ({frames} frames)"
+
+
+def rows_of(
+    source: Path, faults: Sequence[str], into: Path, is_live: bool
+) -> Iterator[tuple[str, ...]]:
     """Fault, sequence, and what came of it."""
     for name in faults:
         place = into / f"fault {list(FAULTS).index(name)}"
         folder = faulty(source, FAULTS[name], place / source.name)
-        yield name, source.name, *outcome(folder, place / "run")
+        yield name, source.name, *(live_outcome if is_live else outcome)(folder, place / "run")
 
 
 def main() -> None:
@@ -142,6 +159,7 @@ def main() -> None:
     parser.add_argument("--into", type=Path)
     parser.add_argument("--only", nargs="+", default=list(NAMES), choices=NAMES)
     parser.add_argument("--faults", nargs="+", default=list(FAULTS), choices=list(FAULTS))
+    parser.add_argument("--live", action="store_true")
     arguments = parser.parse_args()
     lines = []
     with TemporaryDirectory() as temporary:
@@ -152,7 +170,7 @@ def main() -> None:
                 source = into / "source" / name
                 if not source.is_dir():
                     render_sequence(RenderConfig(name, MAX_FRAMES), source)
-            for line in rows_of(source, arguments.faults, into):
+            for line in rows_of(source, arguments.faults, into, arguments.live):
                 lines.append(line)
                 print(" | ".join(line), file=sys.stderr, flush=True)
     print(table(("fault", "sequence", "what the run warns of and finds", "ATE mm"), lines))

@@ -8,6 +8,7 @@ scale of depth has no statistic: images and depth fit a world of any size equall
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +33,8 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.run_folder.metrics import row
 from bmask_slam.sequences.sequence import Sequence
+
+logger = logging.getLogger(__name__)
 
 MAX_KEYFRAMES = 60
 MAX_FOCAL_CHANGE, MAX_FOCAL_BOUND = 0.015, 0.02
@@ -107,12 +110,28 @@ def with_sure_delay(
     found = register(scores)
     if found is None or found.strength < MIN_STRENGTH:
         return None
-    if abs(found.delay_s) - NORMAL_95 * found.delay_sigma_s < LARGE_DELAY_S:
-        return None
     found_s, bound_s = round(offset_s + found.delay_s, 4), NORMAL_95 * found.delay_sigma_s
     shown = f"colour-depth delay {1e3 * found_s:.1f} ± {1e3 * bound_s:.1f} ms by edges of depth"
+    logger.info("calibration: %s: estimated", shown)
+    if not is_large(abs(found.delay_s) - bound_s):
+        return None
     camera = replace(state.camera, depth_time_offset_s=found_s)
-    return replace(state, camera=camera, text=f"{shown}: found and applied")
+    before = f"{state.text}; " if state.adopted else ""
+    return replace(state, camera=camera, text=f"{before}{shown}: found and applied")
+
+
+def delay_warning(scores: EdgeScores, camera: Camera) -> str:
+    """What edges of depth say against a camera's delay, with a cure; "" where they do not."""
+    found = register(scores)
+    if found is None or found.strength < MIN_STRENGTH:
+        return ""
+    finding = _delay(found, camera)
+    return finding.text if finding.is_warning else ""
+
+
+def is_large(delay_s: float) -> bool:
+    """Whether a map that was made with a delay of depth so far from the true one is bent by it."""
+    return abs(delay_s) > LARGE_DELAY_S
 
 
 def stored_problem(run: SavedRun) -> CalibrationProblem | None:

@@ -282,12 +282,14 @@ class CameraEstimated:
         motions: of the keyframes in the map, for ``UseCamera``.
         text: one line for the log and the summary; "" if nothing can be said yet.
         done: whether no further estimate is needed.
+        bent: whether the map is bent beyond repair by the camera that it was made with.
     """
 
     camera: Camera | None
     motions: dict[int, KeyframeMotion]
     text: str
     done: bool
+    bent: bool = False
 
 
 @dataclass(frozen=True)

@@ -80,6 +80,7 @@ class LiveSystem(SlamSystem):
         self._measured: deque[Measurements] = deque()
         self._own_factors = -1
         self._located = 0
+        self._bent = False  # the map, by the camera before
         self.label_names = (segmenter or NoSegmenter).labels.names
         self.mask_listeners: list[Callable[[Masks], None]] = []
         with ExitStack() as undo:
@@ -96,6 +97,10 @@ class LiveSystem(SlamSystem):
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
         """Apply the other processes' results, then do the same step as offline."""
         self.catch_up()
+        if self._bent:
+            self._bent = False
+            self.events.calibration("the map so far is bent by depth's delay and begins anew")
+            self.begin_anew()
         found = self.watch.look(frame, self.camera) if self.watch is not None else None
         if found is not None:
             self._found_covered(*found)
@@ -160,13 +165,16 @@ class LiveSystem(SlamSystem):
             answer = self.calibration.update(self.remote)
             if answer is not None:
                 if answer.camera is not None:
-                    paths = self.remote.history.trajectories(self.remote.world)
-                    camera = replace(answer.camera, covered=self.camera.covered)
-                    moved = motions_without_images(
-                        self.frame_observations, paths, self.camera, camera
-                    )
-                    self.use_camera(camera, answer.motions, moved)
+                    self._bent = answer.bent
+                    self._use_found(answer.camera, answer.motions)
                 self.events.calibration(self.calibration.text)
+
+    def _use_found(self, found: Camera, motions: Mapping[int, KeyframeMotion]) -> None:
+        """Go on with a camera that calibration has found."""
+        camera = replace(found, covered=self.camera.covered)
+        paths = self.remote.history.trajectories(self.remote.world)
+        moved = motions_without_images(self.frame_observations, paths, self.camera, camera)
+        self.use_camera(camera, motions, moved)
 
     def _follow_map(self, reference: Keyframe, T_before: Array) -> None:
         """Move tracking with a keyframe whose pose was T_before (4, 4).

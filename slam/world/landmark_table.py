@@ -275,3 +275,12 @@ class LandmarkTable:
             setattr(self, name, array[: self._size])
         for name, column in self._appearance.views(self.row).items():
             setattr(self, name, column)
+
+
+def ends_of_chains(old_ids: Ints, new_ids: Ints) -> tuple[Ints, Ints]:
+    """The duplicates (M,), ascending, and what each is in the end, also if that is a duplicate."""
+    old, last = np.unique(old_ids[::-1], return_index=True)
+    new = new_ids[::-1][last]
+    while len(again := np.flatnonzero(np.isin(new, old))):
+        new[again] = new[np.searchsorted(old, new[again])]
+    return old, new

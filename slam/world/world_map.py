@@ -14,7 +14,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.disk_arrays import DiskRecords
 from bmask_slam.graph.geometry import step_lengths, transform
 from bmask_slam.world.keyframe import CulledKeyframe, Keyframe
-from bmask_slam.world.landmark_table import LandmarkTable
+from bmask_slam.world.landmark_table import LandmarkTable, ends_of_chains
 from bmask_slam.world.observers import Observers
 
 MAX_CULLED = 500
@@ -99,15 +99,21 @@ class WorldMap:
         return [k for k in self.keyframes.values() if k.segment == segment]
 
     def largest_segment(self) -> int:
-        """The segment with most keyframes, the older of equal ones; 0 where there is none."""
-        counts = Counter(k.segment for k in self.keyframes.values())
-        return min(counts, key=lambda segment: (-counts[segment], segment), default=0)
+        """The segment with most keyframes, of those with landmarks if any; the older of equals."""
+        counts, mapped = Counter(k.segment for k in self.keyframes.values()), self.mapped_segments()
+        return max(counts, key=lambda s: (s in mapped, counts[s], -s), default=0)
+
+    def mapped_segments(self) -> set[int]:
+        """The segments that have landmarks."""
+        return set(self._segments(np.unique(self.landmarks.host[self.landmarks.in_map])))
 
     def segment_of(self, landmark_ids: Ints) -> int:
         """The segment whose keyframes made most of these landmarks."""
-        hosts = self.landmarks.host[landmark_ids]
-        segments = [self.keyframes[h].segment for h in hosts if h in self.keyframes]
-        return int(np.bincount(segments).argmax())
+        return int(np.bincount(self._segments(self.landmarks.host[landmark_ids])).argmax())
+
+    def _segments(self, keyframe_ids: Ints) -> list[int]:
+        """Those of keyframes (N,), if they are in the map."""
+        return [self.keyframes[k].segment for k in keyframe_ids.tolist() if k in self.keyframes]
 
     def travelled(self) -> tuple[Ints, Array]:
         """Ids (K,) of all keyframes, ascending, and (K, 2) radians and metres of path up to each.
@@ -267,7 +273,7 @@ class WorldMap:
         Returns the ids that were removed. A keyframe that observes both keeps the new one's
         keypoint, since one landmark has one place in an image.
         """
-        old, new = _ends_of_chains(old_ids, new_ids)
+        old, new = ends_of_chains(old_ids, new_ids)
         new_ids = new[np.searchsorted(old, old_ids)]
         involved, present = np.zeros((2, len(self.landmarks) + 1), bool)
         involved[old_ids] = True
@@ -288,12 +294,3 @@ class WorldMap:
         self.landmarks.replaced_by[old_ids] = new_ids
         self.landmarks.remove(old_ids)
         return old_ids
-
-
-def _ends_of_chains(old_ids: Ints, new_ids: Ints) -> tuple[Ints, Ints]:
-    """The duplicates (M,), ascending, and what each is in the end, also if that is a duplicate."""
-    old, last = np.unique(old_ids[::-1], return_index=True)
-    new = new_ids[::-1][last]
-    while len(again := np.flatnonzero(np.isin(new, old))):
-        new[again] = new[np.searchsorted(old, new[again])]
-    return old, new

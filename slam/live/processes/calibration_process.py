@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,7 @@ from bmask_slam.calibration.adoption import (
     format_found,
     judged,
 )
-from bmask_slam.calibration.camera_check import with_sure_delay
+from bmask_slam.calibration.camera_check import delay_warning, is_large, with_sure_delay
 from bmask_slam.calibration.edge_scores import FrameEdges, scores_of
 from bmask_slam.calibration.keyframe_depth import KeptDepths, KeyframeDepth, KeyframeImages
 from bmask_slam.calibration.keyframe_motions import keyframe_motions
@@ -48,6 +48,8 @@ from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 
+BENT_SHARE = 1 / 40
+"""Of the image's width; so far has the image moved meanwhile, in the median."""
 MAX_IMAGES = 80
 """Keyframes whose depth images are kept, 1.2 MB each at 640 x 480."""
 
@@ -99,12 +101,12 @@ class CalibrationServer:
         self._setup = setup
         self._depths: dict[int, KeyframeDepth] = {}
         self._edges: dict[int, FrameEdges] = {}
-        self._state = SelfCalibration(setup.camera, setup.camera)
+        self._state, self._looks = SelfCalibration(setup.camera, setup.camera), 0
 
     def add(self, images: KeyframeImages) -> None:
         """Keep what is needed of a keyframe's images."""
         self._depths[images.id] = KeyframeDepth.of(images)
-        if self._setup.looks_at_edges and not self._state.adopted:
+        if self._looks_at_edges:
             depth_m, camera = images.depth.depth_m.astype(float), self._setup.camera
             lag_s = images.lag_s + camera.depth_time_offset_s
             self._edges[images.id] = FrameEdges.of(images.rgb, depth_m, lag_s, camera)
@@ -116,12 +118,14 @@ class CalibrationServer:
     def estimate(self, message: EstimateCamera) -> CameraEstimated:
         """What the keyframes say of the camera.
 
-        Those of a camera without a readout time are asked once more after one is adopted.
+        Those of a camera without a readout time are asked once more after one is adopted, those of
+        a map that begins anew, since the one before was bent, and those whose edges contradict it.
         """
         setup, config, before = self._setup, self._setup.config, self._state
+        self._looks += 1
         run, world, paths = read_state(message.state, setup.graph)
         kept = {k: depth for k, depth in self._depths.items() if k in world.keyframes}
-        state = replace(before, looks=before.looks + 1)
+        state = before
         try:
             reader = KeptDepths(kept, run.camera)
             estimate = estimate_again(world, run, reader, setup.camera, config.min_change_s)
@@ -131,26 +135,40 @@ class CalibrationServer:
         if estimate is not None:
             logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
             state = judged(before, estimate, setup.mode, config, setup.free)
-        late = None if TIME in adopted_parameters(state) else self._by_edges(run, world)
-        self._state = state = late or state
+        state, warning = self._by_edges(state, run, world)
+        self._state, text = state, "; ".join(filter(None, (state.text, warning)))
+        last = self._looks >= config.stretches
         if state.adopted and state.camera != run.camera:
             motions = self._motions(world, paths, run, state.camera)
-            done = before.adopted or (late is None and setup.camera.rolling_shutter_s != 0)
-            return CameraEstimated(state.camera, motions, state.text, done)
-        done = state.adopted or state.settled or state.looks >= config.stretches
-        return CameraEstimated(None, {}, state.text, done)
+            bent = _is_bent(world, run, state.camera)
+            done = before.adopted or setup.camera.rolling_shutter_s != 0
+            settled = last or (done and not bent and not warning)
+            return CameraEstimated(state.camera, motions, text, settled, bent)
+        done = state.adopted or state.settled
+        return CameraEstimated(None, {}, text, last or (done and not warning))
 
-    def _by_edges(self, run: SavedRun, world: WorldMap) -> SelfCalibration | None:
-        """The state with a delay of depth that its edges show, if that is large."""
+    @property
+    def _looks_at_edges(self) -> bool:
+        """Whether they are kept: as long as no delay is known."""
+        return self._setup.looks_at_edges and TIME not in adopted_parameters(self._state)
+
+    def _by_edges(
+        self, state: SelfCalibration, run: SavedRun, world: WorldMap
+    ) -> tuple[SelfCalibration, str]:
+        """The state with a delay of depth that its edges show, if that is large.
+
+        Also a warning, if they show one that is no right camera's, and is not used.
+        """
         path = run.trajectories["trajectory.txt"]
         kept = [k for k in self._edges if k in world.keyframes]
-        if self._state.adopted or not kept or not len(path):
-            return None
+        if TIME in adopted_parameters(state) or not kept or not len(path):
+            return state, ""
         twists = twists_at(path, np.array([world.keyframes[k].timestamp_s for k in kept]))
         moving = np.flatnonzero(twists.any(axis=1))
         edges = [self._edges[kept[i]] for i in moving.tolist()]
         scores = scores_of(edges, twists[moving], run.camera)
-        return with_sure_delay(self._state, scores, run.camera.depth_time_offset_s)
+        late = with_sure_delay(state, scores, run.camera.depth_time_offset_s)
+        return (state, delay_warning(scores, run.camera)) if late is None else (late, "")
 
     def _motions(
         self, world: WorldMap, paths: dict[int, Trajectory], run: SavedRun, camera: Camera
@@ -169,6 +187,18 @@ class CalibrationServer:
 
         retimed = offset_s != run.camera.depth_time_offset_s
         return keyframe_motions(world, paths, change if retimed else None)
+
+
+def _is_bent(world: WorldMap, run: SavedRun, camera: Camera) -> bool:
+    """Whether depth came so late, by another camera, that it was of other surfaces.
+
+    Depth of the same surface is brought to the colour image's time by how fast it changes.
+    """
+    late_s = camera.depth_time_offset_s - run.camera.depth_time_offset_s
+    stamps_s = np.array([k.timestamp_s for k in world.keyframes.values()])
+    rates = np.linalg.norm(twists_at(run.trajectories["trajectory.txt"], stamps_s)[:, :3], axis=1)
+    moved_px = camera.fx * np.median(rates[rates > 0]) * abs(late_s) if rates.any() else 0.0
+    return is_large(late_s) and bool(moved_px > BENT_SHARE * camera.width)
 
 
 def read_state(

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from faults import LONG_S
 from recorded_bags import DEPTH, INFO, RGB, BagMaker, image
+from shifted_stamps import with_depth_stamps
 
 from bmask_slam.calibration.adoption import SelfCalibrationConfig
 from bmask_slam.config.configuration import resolve
@@ -103,6 +104,25 @@ def test_a_robot_that_sees_itself_leaves_itself_out(robot, short_stretch, tmp_pa
     assert errors.value("ate_rmse") < 0.02
     told = played(robot, tmp_path / "told", "report")
     assert told.calibration.endswith("found, not left out") and not told.camera.covered
+
+
+def test_a_map_that_late_depth_has_bent_begins_anew(
+    late_sweep, sweep_camera, short_stretch, monkeypatch, tmp_path
+) -> None:
+    monkeypatch.setattr(start, "SelfCalibrationConfig", partial(SelfCalibrationConfig, frames=70))
+    late = open_sequence(with_depth_stamps(late_sweep, tmp_path / "late", 0.08))
+    slam = played(late, tmp_path / "run", "auto")
+    right_s = sweep_camera.depth_time_offset_s - 0.08
+    assert slam.camera.depth_time_offset_s == pytest.approx(right_s, abs=0.01)
+    events = Run(tmp_path / "run").events
+    assert [e for e in events if "bent by depth's delay and begins anew" in e.text]
+    anew = [e for e in events if e.kind is EventKind.SEGMENT]
+    paths = read_run(tmp_path / "run").trajectories
+    path, bent = paths["trajectory.txt"], paths["trajectory_segment_0.txt"]
+    assert path.timestamps_s[0] == pytest.approx(anew[-1].timestamp_s) and len(path) < len(bent)
+    assert late.groundtruth is not None
+    errors_m = [evaluate_trajectory(p, late.groundtruth).value("ate_rmse") for p in (path, bent)]
+    assert errors_m[0] < min(0.02, errors_m[1])
 
 
 def test_a_source_that_pairs_images_gets_the_delay_that_edges_show(
