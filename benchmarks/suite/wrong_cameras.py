@@ -136,9 +136,7 @@ def outcome(folder: Path, out: Path) -> tuple[str, str]:
 
 def live_outcome(folder: Path, out: Path) -> tuple[str, str]:
     """What `live` found of the camera, and its ATE in mm with the number of frames."""
-    told = json.loads(
-        call(["-m", "bmask_slam", "live", str(folder), "--out", str(out), "--quiet", "--json"])
-    )
+    told = json.loads(call(["-m", "bmask_slam", "live", str(folder), "--out", str(out), "--json"]))
     rows = {row["name"]: row["value"] for row in told["metrics"]}
     frames = len(Run(out).trajectory)
     return told["calibration"] or "-", f"{1e3 * rows['ate_rmse']:.1f} ({frames} frames)"

@@ -113,7 +113,7 @@ def with_sure_delay(
     found_s, bound_s = round(offset_s + found.delay_s, 4), NORMAL_95 * found.delay_sigma_s
     shown = f"colour-depth delay {1e3 * found_s:.1f} ± {1e3 * bound_s:.1f} ms by edges of depth"
     logger.info("calibration: %s: estimated", shown)
-    if not is_large(abs(found.delay_s) - bound_s):
+    if abs(found.delay_s) - bound_s < LARGE_DELAY_S:
         return None
     camera = replace(state.camera, depth_time_offset_s=found_s)
     before = f"{state.text}; " if state.adopted else ""
@@ -127,11 +127,6 @@ def delay_warning(scores: EdgeScores, camera: Camera) -> str:
         return ""
     finding = _delay(found, camera)
     return finding.text if finding.is_warning else ""
-
-
-def is_large(delay_s: float) -> bool:
-    """Whether a map that was made with a delay of depth so far from the true one is bent by it."""
-    return abs(delay_s) > LARGE_DELAY_S
 
 
 def stored_problem(run: SavedRun) -> CalibrationProblem | None:

@@ -16,13 +16,14 @@ import numpy as np
 from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.calibration.adoption import (
     FREE,
+    Estimate,
     SelfCalibration,
     SelfCalibrationConfig,
     adopted_parameters,
     format_found,
     judged,
 )
-from bmask_slam.calibration.camera_check import delay_warning, is_large, with_sure_delay
+from bmask_slam.calibration.camera_check import MAX_DELAY_S, delay_warning, with_sure_delay
 from bmask_slam.calibration.edge_scores import FrameEdges, scores_of
 from bmask_slam.calibration.keyframe_depth import KeptDepths, KeyframeDepth, KeyframeImages
 from bmask_slam.calibration.keyframe_motions import keyframe_motions
@@ -119,7 +120,7 @@ class CalibrationServer:
         """What the keyframes say of the camera.
 
         Those of a camera without a readout time are asked once more after one is adopted, those of
-        a map that begins anew, since the one before was bent, and those whose edges contradict it.
+        a map that begins anew, since the one before was bent, and all while its delay is not known.
         """
         setup, config, before = self._setup, self._setup.config, self._state
         self._looks += 1
@@ -135,17 +136,20 @@ class CalibrationServer:
         if estimate is not None:
             logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
             state = judged(before, estimate, setup.mode, config, setup.free)
-        state, warning = self._by_edges(state, run, world)
-        self._state, text = state, "; ".join(filter(None, (state.text, warning)))
-        last = self._looks >= config.stretches
+        state, doubt = self._by_edges(state, run, world)
+        doubt = doubt or self._doubt(state, estimate)
+        self._state, text = state, "; ".join(filter(None, (state.text, doubt)))
+        shown = estimate is not None and estimate.shows(TIME, config)
+        known = shown or TIME not in setup.free or TIME in adopted_parameters(state)
+        last, clear = self._looks >= config.stretches, known and not doubt
         if state.adopted and state.camera != run.camera:
             motions = self._motions(world, paths, run, state.camera)
             bent = _is_bent(world, run, state.camera)
             done = before.adopted or setup.camera.rolling_shutter_s != 0
-            settled = last or (done and not bent and not warning)
+            settled = last or (done and not bent and clear)
             return CameraEstimated(state.camera, motions, text, settled, bent)
         done = state.adopted or state.settled
-        return CameraEstimated(None, {}, text, last or (done and not warning))
+        return CameraEstimated(None, {}, text, last or (done and clear))
 
     @property
     def _looks_at_edges(self) -> bool:
@@ -169,6 +173,15 @@ class CalibrationServer:
         scores = scores_of(edges, twists[moving], run.camera)
         late = with_sure_delay(state, scores, run.camera.depth_time_offset_s)
         return (state, delay_warning(scores, run.camera)) if late is None else (late, "")
+
+    def _doubt(self, state: SelfCalibration, estimate: Estimate | None) -> str:
+        """A delay that is not sure enough to be adopted beside what was; "" if there is none."""
+        setup = self._setup
+        if estimate is None or not state.adopted or TIME not in setup.free:
+            return ""
+        if TIME in adopted_parameters(state) or not estimate.differs(TIME, setup.config):
+            return ""
+        return format_found(estimate, (TIME,), "not sure enough to be applied")
 
     def _motions(
         self, world: WorldMap, paths: dict[int, Trajectory], run: SavedRun, camera: Camera
@@ -198,7 +211,7 @@ def _is_bent(world: WorldMap, run: SavedRun, camera: Camera) -> bool:
     stamps_s = np.array([k.timestamp_s for k in world.keyframes.values()])
     rates = np.linalg.norm(twists_at(run.trajectories["trajectory.txt"], stamps_s)[:, :3], axis=1)
     moved_px = camera.fx * np.median(rates[rates > 0]) * abs(late_s) if rates.any() else 0.0
-    return is_large(late_s) and bool(moved_px > BENT_SHARE * camera.width)
+    return abs(late_s) > MAX_DELAY_S and bool(moved_px > BENT_SHARE * camera.width)
 
 
 def read_state(

@@ -11,8 +11,14 @@ import numpy as np
 import pytest
 from shifted_stamps import with_depth_stamps
 
-from bmask_slam.calibration.camera_check import CameraCheck, check_camera
-from bmask_slam.calibration.edge_scores import correlation, edges_of
+from bmask_slam.calibration.adoption import SelfCalibration
+from bmask_slam.calibration.camera_check import (
+    CameraCheck,
+    check_camera,
+    delay_warning,
+    with_sure_delay,
+)
+from bmask_slam.calibration.edge_scores import correlation, edge_scores, edges_of
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import plot
 from bmask_slam.graph.camera import Camera
@@ -119,6 +125,27 @@ def test_stamps_of_depth_that_are_wrong_are_named(
     shifted = with_depth_stamps(late_sweep, tmp_path, frames / FPS)
     (warning,) = (w for w in _checked(right, shifted).warnings if w.startswith("stamps"))
     assert ("ms earlier" if frames > 0 else "ms later") in warning
+
+
+@pytest.mark.parametrize("late_s", [0.0, 1 / FPS])
+def test_edges_warn_of_a_delay_and_give_one_that_is_sure(
+    late_sweep: Path, right: RunSummary, tmp_path: Path, late_s: float
+) -> None:
+    saved = read_run(right.folder)
+    camera, path = saved.camera, saved.trajectories["trajectory.txt"]
+    shifted = with_depth_stamps(late_sweep, tmp_path, late_s)
+    scores = edge_scores(open_sequence(shifted, camera=camera), path)
+    assert delay_warning(scores, camera).startswith("stamps: depth images are") == bool(late_s)
+    turned = dataclasses.replace(camera, rolling_shutter_s=0.02)
+    before = SelfCalibration(
+        camera, turned, text="rolling shutter 20.0 ± 1.0 ms: found and applied"
+    )
+    late = with_sure_delay(before, scores, camera.depth_time_offset_s)
+    assert (late is not None) == bool(late_s)
+    if late is not None:
+        right_s = camera.depth_time_offset_s - late_s
+        assert late.camera.depth_time_offset_s == pytest.approx(right_s, abs=0.01)
+        assert late.camera.rolling_shutter_s == 0.02 and late.text.startswith(before.text)
 
 
 def test_depth_edges_are_where_the_surface_in_front_ends() -> None:
