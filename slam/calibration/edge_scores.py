@@ -22,7 +22,7 @@ from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.tracking.rolling_shutter import velocities
 
 FRAMES = 32
-RADIUS = 20
+RADIUS = 32
 """Steps of the largest shift; a step is about 1/320 of the image's width."""
 WIDTH_STEPS = 320
 JUMP = 0.1
