@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number
 from bmask_slam.graph.files.reading import read_lines
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.graph.geometry import (
     inverse,
     make_pose,
@@ -20,7 +21,6 @@ from bmask_slam.graph.geometry import (
     se3_exp,
     se3_log,
 )
-from bmask_slam.graph.whole_file import whole_file
 
 MAX_TIME_DIFFERENCE_S = 0.02
 MAX_STAMP_ERROR_S = 1e-5  # of stamps with six decimals

@@ -14,9 +14,9 @@ import numpy as np
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError, finite_number, is_whole
 from bmask_slam.graph.files.reading import read_lines
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.graph.geometry import make_pose, quaternion_from_rotation, rotation_from_quaternion
 from bmask_slam.graph.trajectory import Trajectory, check_quaternion, read_tum
-from bmask_slam.graph.whole_file import whole_file
 
 EUROC_HEADER = (
     "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from bmask_slam.cli import main
 from bmask_slam.comparison.jobs.job import Job, figures_file
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 
 
 def end_with_parent() -> None:

@@ -28,7 +28,7 @@ from source_tree import (
 # or a module that stands alone); [...] are the other modules of the folder, which make one room.
 ROOMS = {
     "the layers": "graph  semantics  mapping  slam",
-    "graph": """arrays  errors  whole_file  files  [...]  inertial  factors  sensors  marginals
+    "graph": """arrays  errors  files  [...]  inertial  factors  sensors  marginals
                 smoother  batch  pose_graph  g2o  calibration""",
     "semantics": """[...]  instances  network  weights  segmenters  beliefs  objects  tracks
                     training""",

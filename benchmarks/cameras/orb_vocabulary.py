@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.paths import SHARED
 from bmask_slam.graph.arrays import Bytes, Floats, Ints
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 
 FOLDERS = ("nyuv2/images", "coco_excerpt/images")
 BRANCHES, LEVELS, ROUNDS, SEED = 10, 6, 8, 1

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.paths import SHARED
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.semantics.instances.coco_files import CocoFile, read_coco
 
 EXCERPT = SHARED / "coco_excerpt"

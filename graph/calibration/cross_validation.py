@@ -12,11 +12,9 @@ seen and turned as the camera did; but neighbours are farther apart, and share f
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
@@ -29,9 +27,8 @@ from bmask_slam.graph.calibration.calibration import (
 from bmask_slam.graph.calibration.equations import CAUCHY, squared
 from bmask_slam.graph.calibration.model import PARAMETERS, CalibrationViews, residuals_of
 from bmask_slam.graph.calibration.problem import CalibrationProblem, CalibrationState
+from bmask_slam.graph.threads import in_threads
 
-Half = TypeVar("Half")
-Result = TypeVar("Result")
 MIN_KEYFRAMES = 5
 ALL = range(len(PARAMETERS))
 QUICK = CalibrationConfig(rounds=2, steps=4, tolerance=1e-3)
@@ -69,23 +66,14 @@ def cross_validate(
     first, second = halves_of(problem, alternately)
     if first is None or second is None:
         return None
-    found = of_both(partial(calibrate, config=QUICK), (first, second))
+    found = in_threads(partial(calibrate, config=QUICK), (first, second))
     judges = (second, found[0]), (first, found[1])
-    gains = of_both(lambda judge: _gains(*judge, list(judged)), judges)
+    gains = in_threads(lambda judge: _gains(*judge, list(judged)), judges)
     return CrossValidation(
         np.array([result.calibration for result in found]),
         np.array([np.sqrt(np.diag(result.covariance)) for result in found]),
         np.concatenate(gains),
     )
-
-
-def of_both(work: Callable[[Half], Result], halves: tuple[Half, Half]) -> list[Result]:
-    """What ``work`` makes of both halves, in two threads: most of it is numpy's arithmetic.
-
-    An exception of ``work`` is raised here.
-    """
-    with ThreadPoolExecutor(len(halves), "halves") as threads:
-        return list(threads.map(work, halves))
 
 
 def halves_of(

@@ -10,9 +10,10 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.calibration import CalibrationConfig, calibrate
-from bmask_slam.graph.calibration.cross_validation import halves_of, of_both
+from bmask_slam.graph.calibration.cross_validation import halves_of
 from bmask_slam.graph.calibration.model import BEND, LENS, NORMAL_95, PARAMETERS, SHUTTER, F
 from bmask_slam.graph.calibration.problem import CalibrationProblem
+from bmask_slam.graph.threads import in_threads
 
 MIN_KEYFRAMES = 12
 """Of fewer, the largest error found with right cameras was 5 %, ten times its sigma."""
@@ -69,7 +70,7 @@ def _in_whole_and_halves(problem: CalibrationProblem) -> FocalCheck:
     change, sigma = _common_change(problem)
     if abs(change) <= NORMAL_95 * sigma:
         return FocalCheck(change, sigma, (math.nan, math.nan))
-    first, second = of_both(
+    first, second = in_threads(
         lambda half: _common_change(half)[0] if half else math.nan, halves_of(problem)
     )
     return FocalCheck(change, sigma, (first, second))

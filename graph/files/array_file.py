@@ -29,7 +29,7 @@ from pydantic import TypeAdapter
 from bmask_slam.graph.arrays import Arrays, Ints
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import check_unpacked, in_short
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 
 Header = dict[str, Any]
 _HEADER = "header"

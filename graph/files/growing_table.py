@@ -12,7 +12,7 @@ from typing import IO
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_lock import lock_file
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 
 
 class GrowingTable:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import read_bytes
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 
 _TYPES = {
     "float": "<f4",

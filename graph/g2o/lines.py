@@ -20,11 +20,11 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number, is_whole
 from bmask_slam.graph.files.reading import read_lines
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.graph.g2o.dialects import g2o_words
 from bmask_slam.graph.geometry import make_pose, quaternion_from_rotation, rotation_from_quaternion
 from bmask_slam.graph.pose_graph.pose_graph import planar_coordinates, planar_poses
 from bmask_slam.graph.trajectory import check_quaternion
-from bmask_slam.graph.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
 

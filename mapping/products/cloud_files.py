@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Bytes
-from bmask_slam.graph.whole_file import remove, whole_file
+from bmask_slam.graph.files.whole_file import remove, whole_file
 from bmask_slam.mapping.products.cloud import Cloud
 
 _PLY_NAMES = {"<f4": "float", "|u1": "uchar", "<u2": "ushort"}

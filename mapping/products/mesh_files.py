@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Bytes, Ints
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.cloud_files import ply_properties, ply_rows
 

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints
-from bmask_slam.graph.whole_file import remove
+from bmask_slam.graph.files.whole_file import remove
 from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.cloud_files import CloudWriter
 from bmask_slam.semantics.objects.boxes3d import OrientedBox

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.graph.files.yaml_file import format_yaml
-from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.mapping.products.occupancy import (
     FREE,
     LIMIT,

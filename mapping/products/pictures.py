@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Bytes, Image, Ints
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.whole_file import whole_file, writing
 from bmask_slam.graph.geometry import inverse, transform
-from bmask_slam.graph.whole_file import whole_file, writing
 from bmask_slam.semantics.instances.image_files import write_image
 
 BACKGROUND_COLOUR, WALL_COLOUR = (150, 150, 150), (70, 70, 80)

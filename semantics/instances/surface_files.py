@@ -9,7 +9,7 @@ import numpy as np
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import check_name, target_below
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.semantics.instances.image_files import decode_image, write_image
 from bmask_slam.semantics.instances.surfaces import SurfaceClasses
 from bmask_slam.semantics.labels import LabelSet, read_label_set

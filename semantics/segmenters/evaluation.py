@@ -19,7 +19,7 @@ from pycocotools.cocoeval import COCOeval
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.semantics.instances.coco_files import CocoFile, CocoImage
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.instances.instances import Instance, as_annotation

@@ -15,7 +15,7 @@ from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import target_below
 from bmask_slam.graph.files.json_file import STRICT, read_json
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.semantics.instances.image_files import read_colour, write_image
 from bmask_slam.semantics.instances.instances import Instance, as_annotation
 from bmask_slam.semantics.instances.overlay import draw, draw_surfaces

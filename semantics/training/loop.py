@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from bmask_slam.graph.errors import InputError, whole_number
 from bmask_slam.graph.files.reading import in_short, read_lines
-from bmask_slam.graph.whole_file import open_plain, whole_file
+from bmask_slam.graph.files.whole_file import open_plain, whole_file
 from bmask_slam.semantics.network.yolox.mask_scoring import MaskScoringYolox
 from bmask_slam.semantics.training.dataset import (
     AugmentConfig,

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import read_table
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.semantics.instances.coco_files import read_coco
 from bmask_slam.semantics.labels import LabelSet, read_label_set
 from bmask_slam.semantics.network.config import LIGHT

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from bmask_slam.graph.arrays import Bytes, Image
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.whole_file import open_plain, whole_file
+from bmask_slam.graph.files.whole_file import open_plain, whole_file
 from bmask_slam.semantics.network.backbone.layers import keep_variance
 from bmask_slam.semantics.network.yolox.layers import ConvSiLU
 from bmask_slam.semantics.network.yolox.network import YoloxNano

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.json_file import Name, parse_json
 from bmask_slam.graph.files.reading import check_unpacked, in_short, read_bytes
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.semantics.labels import LabelSet, label_set, read_label_set
 from bmask_slam.semantics.network.config import (
     RESNET50,

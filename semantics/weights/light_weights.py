@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import save_file
 
 from bmask_slam.graph.files.data_files import data_path
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.semantics.labels import LabelSet, read_label_set
 from bmask_slam.semantics.network.yolox.mask_scoring import MaskScoringYolox
 from bmask_slam.semantics.network.yolox.network import YoloxNano

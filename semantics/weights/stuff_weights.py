@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.semantics.labels import LabelSet, label_set
 from bmask_slam.semantics.network.yolox.stuff import StuffHead
 from bmask_slam.semantics.weights.checkpoints import check_state, read_state

@@ -27,11 +27,11 @@ from bmask_slam.graph.calibration.model import (
 from bmask_slam.graph.calibration.problem import Anchors, CalibrationProblem
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.whole_file import check_target
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.metrics import align
 from bmask_slam.graph.smoother.storage import read_graph
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, nearest_indices
-from bmask_slam.graph.whole_file import check_target
 from bmask_slam.run_folder.map_file import SavedRun, read_run
 from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.run_folder.reader import Run

@@ -16,8 +16,8 @@ from bmask_slam.calibration.motion import twists_at
 from bmask_slam.graph.arrays import Array, Floats, Image, Ints
 from bmask_slam.graph.calibration.registration import EdgeScores, strength_of
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.threads import in_threads
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices
-from bmask_slam.runtime.prefetch import in_threads
 from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.tracking.rolling_shutter import velocities
 

@@ -17,8 +17,8 @@ from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.features.keypoint_depth import sample_depth
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.threads import in_threads
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.runtime.prefetch import in_threads
 from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.world.frame_observations import FrameObservations, FrameView
 from bmask_slam.world.keyframe import Keyframe

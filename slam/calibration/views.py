@@ -16,8 +16,8 @@ from bmask_slam.graph.calibration.model import CalibrationViews
 from bmask_slam.graph.camera import NO_DEPTH_DISTORTION, Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations
+from bmask_slam.graph.threads import in_threads
 from bmask_slam.graph.trajectory import nearest_indices
-from bmask_slam.runtime.prefetch import in_threads
 from bmask_slam.sequences.images import SURFACE_STEP
 from bmask_slam.sequences.sequence import Sequence
 

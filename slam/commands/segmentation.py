@@ -88,7 +88,7 @@ def add_evaluate_segmentation(commands: Commands) -> None:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     from bmask_slam.datasets.weights import find_weights
-    from bmask_slam.graph.whole_file import check_target
+    from bmask_slam.graph.files.whole_file import check_target
     from bmask_slam.runtime.progress import counting_bar
     from bmask_slam.semantics.instances.coco_files import read_coco
     from bmask_slam.semantics.segmenters.evaluation import (

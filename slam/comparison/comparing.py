@@ -33,7 +33,7 @@ from bmask_slam.comparison.jobs.pool import LocalPool, Pool, RayPool
 from bmask_slam.comparison.report import write_report
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_lock import take_lock
-from bmask_slam.graph.whole_file import open_plain, writing
+from bmask_slam.graph.files.whole_file import open_plain, writing
 
 logger = logging.getLogger(__name__)
 

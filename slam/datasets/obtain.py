@@ -16,9 +16,9 @@ from bmask_slam.evaluation.reference import BONN, TRUTH_BODY
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import target_below
 from bmask_slam.graph.files.reading import read_lines
+from bmask_slam.graph.files.whole_file import remove, whole_file
 from bmask_slam.graph.files.yaml_file import format_yaml
 from bmask_slam.graph.trajectory import write_tum
-from bmask_slam.graph.whole_file import remove, whole_file
 from bmask_slam.sequences.formats.numbered import FPS_HZ
 from bmask_slam.sequences.formats.numbered_folders import icl_truth
 from bmask_slam.sequences.lists import read_associations

@@ -19,7 +19,7 @@ from typing import IO
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import read_text
-from bmask_slam.graph.whole_file import open_plain, whole_file
+from bmask_slam.graph.files.whole_file import open_plain, whole_file
 
 CHUNK_BYTES = 1 << 20
 TIMEOUT_S = 30.0

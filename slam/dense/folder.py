@@ -42,7 +42,7 @@ from bmask_slam.graph.files.array_file import FileKind, check_like, read_arrays,
 from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.files.json_file import Name, check_json, read_json
 from bmask_slam.graph.files.reading import MAX_LINE, read_bytes
-from bmask_slam.graph.whole_file import whole_file, writing
+from bmask_slam.graph.files.whole_file import whole_file, writing
 from bmask_slam.mapping.inverse_depth.dense_mapper import FusedKeyframe
 from bmask_slam.mapping.inverse_depth.depth_map import (
     InverseDepthMap,

@@ -20,23 +20,24 @@ from bmask_slam.dense.options import MapOptions, resolve_options
 from bmask_slam.dense.products import Products, write_products
 from bmask_slam.dense.saved_map import MappedRun, open_run, with_right_images
 from bmask_slam.dense.surface import FusedMap
-from bmask_slam.graph.arrays import Image, Mask
+from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_lock import lock_file
-from bmask_slam.graph.whole_file import remove
+from bmask_slam.graph.files.whole_file import remove
 from bmask_slam.labelling.awaited_masks import LAG
+from bmask_slam.labelling.mask_memory import MaskMemory, RememberingSegmenter
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.labelling.upright_images import upright_of
 from bmask_slam.mapping.inverse_depth.dense_mapper import WINDOW, DenseKeyframe
 from bmask_slam.run_folder.frame_file import FRAMES as FRAME_TABLE
 from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.runtime.memory import give_back_memory
-from bmask_slam.runtime.prefetch import prepared_ahead
 from bmask_slam.semantics.instances.instances import Instance
-from bmask_slam.semantics.segmenters.segmenter import Segmenter, begin_early
+from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
 from bmask_slam.semantics.segmenters.upright import Upright
 from bmask_slam.semantics.torch_threads import one_thread
+from bmask_slam.sequences.prefetch import prefetched
 from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.tracking.results import FrameResult
 from bmask_slam.world.keyframe import Keyframe
@@ -161,8 +162,9 @@ class RunFusion:
         counts.reused += before
         chosen = [k for k, wanted in zip(keyframes, needed, strict=True) if wanted]
         with one_thread():
-            for done, (keyframe, read) in enumerate(prepared_ahead(self._read, chosen), 1):
-                self._fuse(keyframe, read)
+            read = prefetched(map(self._read, chosen))
+            for done, (keyframe, found) in enumerate(zip(chosen, read, strict=True), 1):
+                self._fuse(keyframe, found)
                 progress(before + done, len(keyframes))
             self._fusion.finish()
         if not counts.fused + counts.reused:
@@ -186,28 +188,6 @@ def open_fusion(options: MapOptions) -> RunFusion:
     return RunFusion(run, segmenter, replace(options, masks=masks))
 
 
-class CachingSegmenter:
-    """A segmenter that keeps the instances of the last images, for a second caller."""
-
-    def __init__(self, segmenter: Segmenter) -> None:
-        self.labels = segmenter.labels
-        self._segmenter = segmenter
-        self._known: dict[str, list[Instance]] = {}
-
-    def begin(self, image: Image, name: str) -> None:
-        """Begin with an image that is not known, where the segmenter works beside this process."""
-        if name not in self._known:
-            begin_early(self._segmenter, image, name)
-
-    def segment(self, image: Image, name: str) -> list[Instance]:
-        """The instances in an image."""
-        if name not in self._known:
-            self._known[name] = self._segmenter.segment(image, name)
-            if len(self._known) > LAG + 1:
-                del self._known[next(iter(self._known))]
-        return self._known[name]
-
-
 def dense_follower(
     world: WorldMap, semantics: SemanticMapper, sequence: Sequence, options: MapOptions
 ) -> Callable[[FrameResult], None]:
@@ -220,7 +200,8 @@ def dense_follower(
     Raises:
         InputError: the folder cannot be written, or the options cannot be used.
     """
-    segmenter = semantics.segmenter = CachingSegmenter(semantics.segmenter)
+    last = MaskMemory(LAG + 1)
+    segmenter = semantics.segmenter = RememberingSegmenter(semantics.segmenter, last)
     mapped = MappedRun(options.run, world, [], sequence.camera, sequence=sequence)
     options = replace(options, masks=semantics.config.segmenter)
     fusion = RunFusion(mapped, segmenter, options)

@@ -16,7 +16,7 @@ from bmask_slam.graph.arrays import Floats, Ints
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import fitting
 from bmask_slam.graph.files.file_names import file_stem
-from bmask_slam.graph.whole_file import remove
+from bmask_slam.graph.files.whole_file import remove
 from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.cloud_files import CloudWriter
 from bmask_slam.mapping.products.floor_plan import FloorPlan, plan_frame, up_direction

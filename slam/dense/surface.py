@@ -18,8 +18,8 @@ from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import refuse_link
+from bmask_slam.graph.files.whole_file import remove, writing
 from bmask_slam.graph.trajectory import nearest_indices, read_tum
-from bmask_slam.graph.whole_file import remove, writing
 from bmask_slam.mapping.inverse_depth.depth_map import MeasurementConfig, from_sensor
 from bmask_slam.mapping.inverse_depth.regularisation import regularise
 from bmask_slam.mapping.products.surface_labels import dilate
@@ -35,10 +35,10 @@ from bmask_slam.mapping.surface.following import FollowingSurface, read_kept
 from bmask_slam.mapping.surface.gate import DepthView, KeyframeSurface, judge_of
 from bmask_slam.mapping.surface.volume import SurfaceVolume
 from bmask_slam.run_folder.frame_file import FRAMES, read_frames
-from bmask_slam.runtime.prefetch import prepared_ahead
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.torch_threads import one_thread
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.prefetch import prefetched
 from bmask_slam.tracking.results import TrackingStatus
 from bmask_slam.world.keyframe import Keyframe
 
@@ -127,8 +127,8 @@ class _SurfaceMaker:
         new = {n: T for n, T in frames.items() if n not in surface}
         handled = len(poses) - len(new)
         progress(handled, len(poses))
-        prepared = prepared_ahead(lambda number: self._frame(number, new[number]), new)
-        for done, (number, frame) in enumerate(prepared, handled + 1):
+        ahead = prefetched(self._frame(number, T) for number, T in new.items())
+        for done, (number, frame) in enumerate(zip(new, ahead, strict=True), handled + 1):
             if frame is not None:
                 surface.add(number, frame)
             progress(done, len(poses))

@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from bmask_slam.events import Event, EventKind
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.graph.metrics import AbsoluteError, absolute_error
 from bmask_slam.graph.trajectory import Trajectory, associate, nearest_indices
-from bmask_slam.graph.whole_file import whole_file
 
 ESTIMATE, REFERENCE, DIFFERENCE = "#1f5fa8", "#9a9a96", "#d6302a"
 MARGINS = {"left": 0.075, "right": 0.985, "bottom": 0.105, "top": 0.915}

@@ -25,8 +25,8 @@ from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, nested, part, read_arrays, write_arrays
+from bmask_slam.graph.files.whole_file import remove
 from bmask_slam.graph.smoother.storage import read_camera
-from bmask_slam.graph.whole_file import remove
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.offline.self_calibration import SelfCalibrator
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder

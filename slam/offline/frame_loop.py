@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from bmask_slam.features.brisk import Features
+from bmask_slam.graph.files.whole_file import remove
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.graph.whole_file import remove
 from bmask_slam.offline.checkpoint import Checkpoints
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.offline.self_calibration import SelfCalibrator

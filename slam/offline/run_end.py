@@ -10,7 +10,7 @@ from pathlib import Path
 from bmask_slam.calibration.camera_check import CameraCheck, check_camera
 from bmask_slam.evaluation import Row
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.whole_file import remove
+from bmask_slam.graph.files.whole_file import remove
 from bmask_slam.offline.frame_loop import ActiveRun, map_options, write_found_camera
 from bmask_slam.run_folder.folder import CHECKPOINT, DENSE
 from bmask_slam.run_folder.metrics import measure, save

@@ -26,10 +26,10 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import fitting, part
 from bmask_slam.graph.files.ply import write_ply
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.graph.smoother.isam2 import SolverError
 from bmask_slam.graph.smoother.storage import write_graph
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.refinement.adjustment_plot import GraphSnapshot, check_picture, draw_adjustment
 from bmask_slam.refinement.carried_along import adjusted_map, move_frames, move_landmarks
 from bmask_slam.run_folder.folder import RunFolder

@@ -18,7 +18,7 @@ from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment, loop_edges
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.whole_file import check_target, whole_file
+from bmask_slam.graph.files.whole_file import check_target, whole_file
 
 PICTURE_TYPES = (".png", ".pdf", ".svg")
 

@@ -11,6 +11,7 @@ from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment, adjust
 from bmask_slam.graph.batch.iteration import Progress
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.whole_file import check_target
 from bmask_slam.graph.g2o.landmark_graphs import write_landmark_graph
 from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
 from bmask_slam.graph.g2o.pose_graphs import read_g2o, write_g2o
@@ -22,7 +23,6 @@ from bmask_slam.graph.pose_graph.optimisation import (
     optimise_pose_graph,
 )
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph
-from bmask_slam.graph.whole_file import check_target
 from bmask_slam.refinement.adjustment_plot import (
     GraphSnapshot,
     View,

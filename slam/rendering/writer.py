@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.whole_file import whole_folder, writing
 from bmask_slam.graph.geometry import quaternion_from_rotation
-from bmask_slam.graph.whole_file import whole_folder, writing
 from bmask_slam.semantics.instances.image_files import write_image
 
 _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]

@@ -16,8 +16,8 @@ from PIL import ImageDraw, ImageFont
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import SIDES, side_towards
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, nearest_indices
-from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.reporting.drawing import COLOURS
 from bmask_slam.reporting.film_cloud import (
     DEPTH_STEP_PX,

@@ -16,8 +16,8 @@ import numpy as np
 from bmask_slam.evaluation import read_reference
 from bmask_slam.events import EventKind
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.reporting.metric_table import BY_NAME
 from bmask_slam.reporting.page import Page, page_text
 from bmask_slam.reporting.parts import Entry, Listing, Picture, Section, Table, TableRow, Tile

@@ -12,7 +12,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number, is_whole
 from bmask_slam.graph.files.reading import read_lines
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 
 if TYPE_CHECKING:
     from bmask_slam.graph.smoother.smoother import Smoother

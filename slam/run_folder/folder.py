@@ -48,8 +48,8 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_lock import lock_file
 from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.files.growing_table import check_grown
+from bmask_slam.graph.files.whole_file import remove, remove_partial, whole_file, writing
 from bmask_slam.graph.trajectory import Trajectory, write_tum
-from bmask_slam.graph.whole_file import remove, remove_partial, whole_file, writing
 from bmask_slam.run_folder.covariance_file import COVARIANCES
 from bmask_slam.run_folder.frame_file import COLUMNS, FRAMES, frame_row
 from bmask_slam.run_folder.landmark_file import MARKERS

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.growing_table import GrowingTable, written_again
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
 

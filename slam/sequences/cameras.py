@@ -12,8 +12,8 @@ from typing import Any
 
 from bmask_slam.graph.camera import MAX_SIDE_PX, NO_DEPTH_DISTORTION, SIDES, Camera, DepthNoise
 from bmask_slam.graph.errors import InputError, did_you_mean
+from bmask_slam.graph.files.whole_file import whole_file, writing
 from bmask_slam.graph.files.yaml_file import format_yaml, read_yaml
-from bmask_slam.graph.whole_file import whole_file, writing
 from bmask_slam.sequences.camera_presets import (
     PRESETS,
     TUM_CAMERAS,

@@ -8,11 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+AHEAD = 3
+"""Number of items that are made ahead where nothing else is said."""
 FEATURES_AHEAD = 2
 """Number of frames whose features are extracted ahead of tracking, unless frames may be dropped."""
 
 
-def prefetched(items: Iterable[T], depth: int) -> Generator[T, None, None]:
+def prefetched(items: Iterable[T], depth: int = AHEAD) -> Generator[T, None, None]:
     """Yield ``items`` in order while one thread works ``depth`` of them ahead.
 
     An exception in ``items`` is raised here, after all items that came before it. When the

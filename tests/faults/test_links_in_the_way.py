@@ -20,7 +20,7 @@ from bmask_slam.comparison.report.report import write_report
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import file_stem
-from bmask_slam.graph.whole_file import open_plain
+from bmask_slam.graph.files.whole_file import open_plain
 from bmask_slam.live.network.carrying import FilePiece, store
 from bmask_slam.rendering.config import RenderConfig
 from bmask_slam.semantics.instances.surface_files import FOLDER, write_surfaces

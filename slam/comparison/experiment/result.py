@@ -15,7 +15,7 @@ from pydantic import BeforeValidator
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import import_extra
 from bmask_slam.graph.files.json_file import check_json, read_json
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 
 if TYPE_CHECKING:
     import pandas

@@ -15,7 +15,7 @@ from bmask_slam.comparison.experiment.result import CellStatus
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.json_file import read_json
 from bmask_slam.graph.files.reading import read_text
-from bmask_slam.graph.whole_file import open_plain, remove, whole_file
+from bmask_slam.graph.files.whole_file import open_plain, remove, whole_file
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 PROCESS = "bmask_slam.job_process"

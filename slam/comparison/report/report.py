@@ -10,7 +10,7 @@ from bmask_slam.comparison.report.table import metric_tables
 from bmask_slam.comparison.report.text_tables import csv_text, latex_text, markdown_text
 from bmask_slam.comparison.report.verdict_tables import ablation_table, verdict_tables
 from bmask_slam.graph.files.file_names import refuse_link
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.reporting.page import Page, page_text
 from bmask_slam.reporting.parts import Section, slug
 

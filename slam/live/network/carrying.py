@@ -22,7 +22,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Bytes
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import read_bytes
-from bmask_slam.graph.whole_file import open_plain
+from bmask_slam.graph.files.whole_file import open_plain
 from bmask_slam.live.channel import END, Channel
 from bmask_slam.live.messages import Finish, MapSaved, SaveMap, SaveState, StateSaved
 

@@ -12,7 +12,7 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError, finite_number
 from bmask_slam.graph.files.ply import POINTS, read_ply, write_ply
 from bmask_slam.graph.files.reading import read_table
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.run_folder.landmark_file import LANDMARKS
 from bmask_slam.run_folder.object_picture import distinct_colour
 from bmask_slam.run_folder.semantic_files import LABELS, SavedObject, SavedScene, read_scene

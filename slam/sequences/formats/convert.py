@@ -18,9 +18,9 @@ from bmask_slam.evaluation.reference import (
 )
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import MAX_TEXT_BYTES, read_bytes
+from bmask_slam.graph.files.whole_file import whole_folder
 from bmask_slam.graph.sensors.streams import FILES
 from bmask_slam.graph.trajectory import write_tum
-from bmask_slam.graph.whole_file import whole_folder
 from bmask_slam.semantics.instances.image_files import write_image
 from bmask_slam.sequences.cameras import write_camera
 from bmask_slam.sequences.formats.layouts import open_recording

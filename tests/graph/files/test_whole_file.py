@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.whole_file import check_target, whole_file, whole_folder
+from bmask_slam.graph.files.whole_file import check_target, whole_file, whole_folder
 
 
 def test_a_link_is_replaced_and_its_target_kept(tmp_path: Path) -> None:
