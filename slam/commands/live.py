@@ -257,6 +257,7 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
     if is_bag(path):
         recording = bag_topics(arguments).of_path(path)
     return LiveOptions(
+        full_size=arguments.full_size,
         out=arguments.out or free_run_path(f"{source.name}-live"),
         overwrite=arguments.overwrite,
         reference=source.groundtruth,
@@ -291,10 +292,8 @@ def _summary(slam: LiveSlam, source: Source) -> str:
         lines.append(f"Camera      {slam.calibration}")
     lines.append(f"Run folder  {slam.out}")
     if slam.dense is not None:
-        lines.append(
-            f"Dense map   {slam.out}/dense, {slam.dense.points} points"
-            f", {slam.dense.frames} frames besides keyframes"
-        )
+        made_of = f"{slam.dense.points} points, {slam.dense.frames} frames besides keyframes"
+        lines.append(f"Dense map   {slam.out}/dense, {made_of}")
     if counts := source.counts.line():
         lines.append(f"Source      {counts}")
     return "\n".join(lines)

@@ -26,7 +26,8 @@ from bmask_slam.run_folder import metrics
 from bmask_slam.run_folder.folder import HEALTH, RunFolder
 from bmask_slam.run_folder.metrics import RunCounters, row
 from bmask_slam.runtime.scratch import scratch_folder
-from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.frame import Frame, check_frame, reduced_frame
+from bmask_slam.sequences.images import working_camera
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
 from bmask_slam.viewer.scene import Scene
@@ -46,11 +47,13 @@ class Prepared:
     """A frame's features, extracted ahead of tracking.
 
     Attributes:
+        frame: as it is tracked, without a stamp.
         features: as of ``SlamSystem.prepare``.
         ms: time that they took.
         arrived_s: ``time.monotonic()`` when the frame arrived, from which its latency counts.
     """
 
+    frame: Frame
     features: Features
     ms: float
     arrived_s: float
@@ -62,7 +65,8 @@ class LiveSlam(LiveMap):
     A context manager: leaving it ends the processes and saves everything, also after an error.
 
     Attributes:
-        camera: of the frames; another one once calibration has found one.
+        camera: of the frames as they are tracked, reduced if they are large; another one once
+            calibration has found one.
         frames_dropped: by the source, which sets it.
         source_counts: of the source, for ``health``.
         rows: what metrics.json holds, after ``close``.
@@ -76,12 +80,15 @@ class LiveSlam(LiveMap):
     ) -> None:
         """Start the processes; returns when all of them are ready.
 
+        ``camera`` is that of the frames that will be given.
+
         Raises:
             InputError: the run folder cannot be used, or a process cannot start.
         """
-        self.camera = camera
         self.config = config or SystemConfig()
         self.options = options or LiveOptions()
+        self.camera = camera if self.options.full_size else working_camera(camera)
+        self._given = camera
         self.frames_dropped = 0
         self.source_counts = SourceCounts()
         self.rows: list[Row] = []
@@ -95,7 +102,7 @@ class LiveSlam(LiveMap):
             self._recorder = self._open_recorder(stack)
             folder = stack.enter_context(scratch_folder())
             self._display = self._open_display(stack)
-            system = start_system(camera, self.config, self.options, folder)
+            system = start_system(self.camera, self.config, self.options, folder)
             self._system = stack.enter_context(closing(system))
             if self._display is not None:
                 self._display.follow(system)
@@ -128,8 +135,14 @@ class LiveSlam(LiveMap):
     def prepare(self, rgb: Image, depth_m: Floats) -> Prepared:
         """Extract a frame's features for ``track``; may be called ahead, in another thread."""
         arrived_s, started_s = time.monotonic(), time.perf_counter()
-        features = self._system.prepare(Frame(0, 0.0, rgb, depth_m))
-        return Prepared(features, 1e3 * (time.perf_counter() - started_s), arrived_s)
+        frame = self._reduced(Frame(0, 0.0, rgb, depth_m))
+        features = self._system.prepare(frame)
+        return Prepared(frame, features, 1e3 * (time.perf_counter() - started_s), arrived_s)
+
+    def _reduced(self, frame: Frame) -> Frame:
+        """The frame as it is tracked; large images are reduced. Raises InputError if not usable."""
+        k = self.camera.reduced_by // self._given.reduced_by
+        return frame if k == 1 else reduced_frame(check_frame(frame, self._given), k)
 
     def track(
         self,
@@ -161,16 +174,21 @@ class LiveSlam(LiveMap):
         if not self._meter.frames:
             self._begin_s = arrived_s
         frame = Frame(self._meter.frames, timestamp_s, rgb, depth_m, name, depth_lag_s)
-        result = self._process(frame, prepared)
+        frame, result = self._process(frame, prepared)
         self._follow_camera()
         self._counters.count(result)
         self._meter.count(result, 1e3 * (time.monotonic() - arrived_s))
-        self._show(result, rgb)
+        self._show(result, frame.rgb)
         return result
 
-    def _process(self, frame: Frame, prepared: Prepared | None) -> FrameResult:
-        """Do a frame's step; one that is refused is counted."""
+    def _process(self, frame: Frame, prepared: Prepared | None) -> tuple[Frame, FrameResult]:
+        """Do a frame's step; also the frame as it is tracked. One that is refused is counted."""
         try:
+            if prepared is None:
+                frame = self._reduced(frame)
+            else:
+                done = prepared.frame
+                frame = replace(frame, rgb=done.rgb, depth_m=done.depth_m)
             stamp_s = self._clock.checked(frame.timestamp_s)
             features = prepared.features if prepared else None
             result = self._system.process(replace(frame, timestamp_s=stamp_s), features)
@@ -180,7 +198,7 @@ class LiveSlam(LiveMap):
         self._clock.used(stamp_s)
         if prepared is not None:
             result = replace(result, stage_ms={**result.stage_ms, "features": prepared.ms})
-        return result
+        return frame, result
 
     def _show(self, result: FrameResult, rgb: Image) -> None:
         """Write and display a frame."""

@@ -61,6 +61,7 @@ class LiveOptions:
         interpolates: whether it gives depth at the colour image's time by that camera; if not, no
             other delay that is found is used.
         workstation: another machine, which has the map and makes the masks.
+        full_size: large images are not reduced, as ``images.working_camera`` does otherwise.
     """
 
     out: Path | None = None
@@ -78,6 +79,7 @@ class LiveOptions:
     pairs: bool = False
     interpolates: bool = False
     workstation: Workstation | None = None
+    full_size: bool = False
 
     def __post_init__(self) -> None:
         if self.calibrate not in CALIBRATE:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bmask_slam.graph.arrays import Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.sequences.images import without_covered
+from bmask_slam.sequences.images import reduced_colour, reduced_depth, without_covered
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,13 @@ def check_frame(frame: Frame, camera: Camera, last_stamp_s: float = -math.inf) -
     if camera.covered:
         depth_m = without_covered(depth_m.copy(), camera)
     return replace(frame, depth_m=depth_m)
+
+
+def reduced_frame(frame: Frame, k: int) -> Frame:
+    """A frame with images at a k-th of their size, NaN where depth is missing."""
+    depth_m = reduced_depth(frame.depth_m, k)
+    depth_m[depth_m == 0] = np.nan
+    return replace(frame, rgb=reduced_colour(frame.rgb, k), depth_m=depth_m)
 
 
 def check_finite_stamp(stamp_s: float) -> None:

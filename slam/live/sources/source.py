@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from itertools import islice
 from typing import Generic, Protocol, TypeVar
 
@@ -15,8 +15,8 @@ import numpy as np
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.sequences.frame import Frame
-from bmask_slam.sequences.images import reduced_colour, reduced_depth, working_camera
+from bmask_slam.sequences.frame import Frame, reduced_frame
+from bmask_slam.sequences.images import working_camera
 from bmask_slam.sequences.sequence import Sequence
 
 T = TypeVar("T")
@@ -189,11 +189,8 @@ class Reduced(Wrapped):
 
     def frames(self) -> Iterator[Frame]:
         """The source's frames, reduced."""
-        k = self.camera.reduced_by
         for frame in self.source.frames():
-            depth_m = reduced_depth(frame.depth_m, k)
-            depth_m[depth_m == 0] = np.nan
-            yield replace(frame, rgb=reduced_colour(frame.rgb, k), depth_m=depth_m)
+            yield reduced_frame(frame, self.camera.reduced_by)
 
 
 def paced(frames: Iterator[Frame]) -> Iterator[Frame]:

@@ -319,3 +319,24 @@ def test_a_process_that_starts_too_late_is_reported(tmp_path, monkeypatch) -> No
     with pytest.raises(InputError, match="segmenter's process has not begun within 0 s"):
         RemoteSegmenter(SegmenterOptions("none"), tmp_path, policy=RestartPolicy(start_s=0.0))
     assert children() == before
+
+
+@pytest.mark.parametrize("full_size", [False, True])
+def test_large_frames_of_a_program_are_reduced(tmp_path, full_size: bool) -> None:
+    large = CAMERA.of_size(2 * CAMERA.width, 2 * CAMERA.height)
+    options = LiveOptions(tmp_path / "run", full_size=full_size)
+    ones = np.ones((2, 2))
+    with LiveSlam(large, CONFIG, options) as slam:
+        assert slam.camera.recorded() == large
+        assert slam.camera.width == (large.width if full_size else large.width // 2)
+        for frame in FRAMES[:6]:
+            rgb = np.kron(frame.rgb, ones[..., None]).astype(np.uint8)
+            depth_m = np.kron(frame.depth_m, ones).astype(np.float32)
+            prepared = slam.prepare(rgb, depth_m) if frame.index % 2 else None
+            result = slam.track(frame.timestamp_s, rgb, depth_m, prepared)
+            assert result.status is TrackingStatus.OK
+        with pytest.raises(InputError, match=rf"gives uint8 \({large.height}, {large.width}, 3\)"):
+            slam.track(FRAMES[6].timestamp_s, FRAMES[6].rgb, FRAMES[6].depth_m)
+        assert slam.health().frames_refused == 1
+    trajectory = read_tum(tmp_path / "run" / "trajectory.txt")
+    assert error_m(trajectory.poses_world_camera) < 0.02
