@@ -98,8 +98,14 @@ def check_camera(run: SavedRun, sequence: Sequence) -> CameraCheck:
     return CameraCheck(warnings, tuple(f.text for f in findings if not f.is_warning), tuple(rows))
 
 
+def sure_registration(scores: EdgeScores) -> Registration | None:
+    """How depth lies on colour by its edges, where these say it clearly."""
+    found = register(scores)
+    return found if found is not None and found.strength >= MIN_STRENGTH else None
+
+
 def with_sure_delay(
-    state: SelfCalibration, scores: EdgeScores, offset_s: float
+    state: SelfCalibration, found: Registration | None, offset_s: float
 ) -> SelfCalibration | None:
     """The state with the delay of depth that edges show, if it is far from a right camera's.
 
@@ -107,8 +113,7 @@ def with_sure_delay(
     left to that, since edges may deceive where a camera turns evenly: a delay moves them as another
     place of the depth camera does. ``offset_s`` is the delay of the camera that the run uses.
     """
-    found = register(scores)
-    if found is None or found.strength < MIN_STRENGTH:
+    if found is None:
         return None
     found_s, bound_s = round(offset_s + found.delay_s, 4), NORMAL_95 * found.delay_sigma_s
     shown = f"colour-depth delay {1e3 * found_s:.1f} ± {1e3 * bound_s:.1f} ms by edges of depth"
@@ -120,13 +125,10 @@ def with_sure_delay(
     return replace(state, camera=camera, text=f"{before}{shown}: found and applied")
 
 
-def delay_warning(scores: EdgeScores, camera: Camera) -> str:
+def delay_warning(found: Registration | None, camera: Camera) -> str:
     """What edges of depth say against a camera's delay, with a cure; "" where they do not."""
-    found = register(scores)
-    if found is None or found.strength < MIN_STRENGTH:
-        return ""
-    finding = _delay(found, camera)
-    return finding.text if finding.is_warning else ""
+    finding = None if found is None else _delay(found, camera)
+    return finding.text if finding is not None and finding.is_warning else ""
 
 
 def stored_problem(run: SavedRun) -> CalibrationProblem | None:

@@ -31,7 +31,7 @@ from bmask_slam.calibration.adoption import (
     format_found,
     judged,
 )
-from bmask_slam.calibration.camera_check import with_sure_delay
+from bmask_slam.calibration.camera_check import sure_registration, with_sure_delay
 from bmask_slam.calibration.edge_scores import edge_scores
 from bmask_slam.calibration.keyframe_motions import (
     depth_change_between,
@@ -130,7 +130,8 @@ class SelfCalibrator:
         except InputError as error:
             logger.info("calibration: %s", error)
             return None
-        return with_sure_delay(self.state, scores, sequence.camera.depth_time_offset_s)
+        found = sure_registration(scores)
+        return with_sure_delay(self.state, found, sequence.camera.depth_time_offset_s)
 
     def _by_motion(self, system: System, sequence: Sequence) -> SelfCalibration:
         """The state with what observations and depths of the map show.

@@ -23,7 +23,12 @@ from bmask_slam.calibration.adoption import (
     format_found,
     judged,
 )
-from bmask_slam.calibration.camera_check import MAX_DELAY_S, delay_warning, with_sure_delay
+from bmask_slam.calibration.camera_check import (
+    MAX_DELAY_S,
+    delay_warning,
+    sure_registration,
+    with_sure_delay,
+)
 from bmask_slam.calibration.edge_scores import FrameEdges, scores_of
 from bmask_slam.calibration.keyframe_depth import KeptDepths, KeyframeDepth, KeyframeImages
 from bmask_slam.calibration.keyframe_motions import keyframe_motions
@@ -50,7 +55,7 @@ from bmask_slam.world.world_map import WorldMap
 logger = logging.getLogger(__name__)
 
 BENT_SHARE = 1 / 40
-"""Of the image's width; so far has the image moved meanwhile, in the median."""
+"""A map is bent where the image moves by this share of its width while depth is late."""
 MAX_IMAGES = 80
 """Keyframes whose depth images are kept, 1.2 MB each at 640 x 480."""
 
@@ -126,17 +131,17 @@ class CalibrationServer:
         self._looks += 1
         run, world, paths = read_state(message.state, setup.graph)
         kept = {k: depth for k, depth in self._depths.items() if k in world.keyframes}
-        state = before
         try:
             reader = KeptDepths(kept, run.camera)
             estimate = estimate_again(world, run, reader, setup.camera, config.min_change_s)
         except InputError as error:
             logger.info("calibration: %s", error)
             estimate = None
+        by_motion = before
         if estimate is not None:
             logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
-            state = judged(before, estimate, setup.mode, config, setup.free)
-        state, doubt = self._by_edges(state, run, world)
+            by_motion = judged(before, estimate, setup.mode, config, setup.free)
+        state, doubt = self._by_edges(by_motion, run, world)
         doubt = doubt or self._doubt(state, estimate)
         self._state, text = state, "; ".join(filter(None, (state.text, doubt)))
         shown = estimate is not None and estimate.shows(TIME, config)
@@ -145,7 +150,7 @@ class CalibrationServer:
         if state.adopted and state.camera != run.camera:
             motions = self._motions(world, paths, run, state.camera)
             bent = _is_bent(world, run, state.camera)
-            done = before.adopted or setup.camera.rolling_shutter_s != 0
+            done = before.adopted or (state is by_motion and setup.camera.rolling_shutter_s != 0)
             settled = last or (done and not bent and clear)
             return CameraEstimated(state.camera, motions, text, settled, bent)
         done = state.adopted or state.settled
@@ -171,8 +176,9 @@ class CalibrationServer:
         moving = np.flatnonzero(twists.any(axis=1))
         edges = [self._edges[kept[i]] for i in moving.tolist()]
         scores = scores_of(edges, twists[moving], run.camera)
-        late = with_sure_delay(state, scores, run.camera.depth_time_offset_s)
-        return (state, delay_warning(scores, run.camera)) if late is None else (late, "")
+        found = sure_registration(scores)
+        late = with_sure_delay(state, found, run.camera.depth_time_offset_s)
+        return (state, delay_warning(found, run.camera)) if late is None else (late, "")
 
     def _doubt(self, state: SelfCalibration, estimate: Estimate | None) -> str:
         """A delay that is not sure enough to be adopted beside what was; "" if there is none."""

@@ -16,6 +16,7 @@ from bmask_slam.calibration.camera_check import (
     CameraCheck,
     check_camera,
     delay_warning,
+    sure_registration,
     with_sure_delay,
 )
 from bmask_slam.calibration.edge_scores import correlation, edge_scores, edges_of
@@ -134,13 +135,13 @@ def test_edges_warn_of_a_delay_and_give_one_that_is_sure(
     saved = read_run(right.folder)
     camera, path = saved.camera, saved.trajectories["trajectory.txt"]
     shifted = with_depth_stamps(late_sweep, tmp_path, late_s)
-    scores = edge_scores(open_sequence(shifted, camera=camera), path)
-    assert delay_warning(scores, camera).startswith("stamps: depth images are") == bool(late_s)
+    found = sure_registration(edge_scores(open_sequence(shifted, camera=camera), path))
+    assert delay_warning(found, camera).startswith("stamps: depth images are") == bool(late_s)
     turned = dataclasses.replace(camera, rolling_shutter_s=0.02)
     before = SelfCalibration(
         camera, turned, text="rolling shutter 20.0 ± 1.0 ms: found and applied"
     )
-    late = with_sure_delay(before, scores, camera.depth_time_offset_s)
+    late = with_sure_delay(before, found, camera.depth_time_offset_s)
     assert (late is not None) == bool(late_s)
     if late is not None:
         right_s = camera.depth_time_offset_s - late_s
