@@ -154,7 +154,7 @@ class SensorSystem(SystemResults, SensorInput):
     def begin_anew(self) -> None:
         """Begin a segment with the next keyframe, apart from a map that is bent.
 
-        Its landmarks leave the graph, and nothing is recognised by them.
+        Its landmarks leave the graph, and nothing is recognised by them; markers stay.
         """
         self.map.prune_landmarks(np.flatnonzero(self.map.world.landmarks.in_map))
         self.camera_tracker.reset(0)

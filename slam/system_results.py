@@ -90,7 +90,7 @@ class SystemResults(ABC):
         return self.map.history.trajectories(self.map.world)
 
     def largest_segment(self) -> int:
-        """The segment with most frames, of those with landmarks if any; the older of equal ones."""
+        """The mapped segment with most frames, any if none is; the older of equal ones."""
         return self._largest(self.segments())
 
     def _largest(self, segments: dict[int, Trajectory]) -> int:

@@ -46,7 +46,7 @@ class SelfCalibrationConfig:
         frames: after which a run is looked at first; then after twice as many, and again, as long
             as the motion does not show the parameters.
         min_frames: fewer are not looked at, at the end of a sequence.
-        stretches: how often it is looked at in vain at most.
+        stretches: how often it is looked at in vain at most; live how often at all.
         max_sigma_s: largest standard deviation of a time that counts as observable,
         max_sigma_share: or share of the time itself: what is that large is known well enough.
         min_change_sigmas: what is adopted differs by so many standard deviations,

@@ -133,7 +133,11 @@ class LiveSlam(LiveMap):
         return Display(scene)
 
     def prepare(self, rgb: Image, depth_m: Floats) -> Prepared:
-        """Extract a frame's features for ``track``; may be called ahead, in another thread."""
+        """Extract a frame's features for ``track``; may be called ahead, in another thread.
+
+        Raises:
+            InputError: a large frame that ``check_frame`` refuses.
+        """
         arrived_s, started_s = time.monotonic(), time.perf_counter()
         frame = self._reduced(Frame(0, 0.0, rgb, depth_m))
         features = self._system.prepare(frame)

@@ -80,7 +80,6 @@ class LiveSystem(SlamSystem):
         self._measured: deque[Measurements] = deque()
         self._own_factors = -1
         self._located = 0
-        self._bent = False  # the map, by the camera before
         self.label_names = (segmenter or NoSegmenter).labels.names
         self.mask_listeners: list[Callable[[Masks], None]] = []
         with ExitStack() as undo:
@@ -97,14 +96,14 @@ class LiveSystem(SlamSystem):
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
         """Apply the other processes' results, then do the same step as offline."""
         self.catch_up()
-        if self._bent:
-            self._bent = False
+        found = self.calibration
+        if found is not None and self.remote.extends and found.begins_anew(frame, self.camera):
             self.events.calibration("the map so far is bent by depth's delay and begins anew")
             self.begin_anew()
-        found = self.watch.look(frame, self.camera) if self.watch is not None else None
-        if found is not None:
-            self._found_covered(*found)
-        result = super().process(frame, features if found is None else None)
+        seen = self.watch.look(frame, self.camera) if self.watch is not None else None
+        if seen is not None:
+            self._found_covered(*seen)
+        result = super().process(frame, features if seen is None else None)
         if self.calibration is not None:
             self.calibration.add_frame(frame, self._keyframe(result))
         return result
@@ -162,11 +161,10 @@ class LiveSystem(SlamSystem):
         if reference is not None and T_before is not None and self.remote.changes != changes:
             self._follow_map(reference, T_before)
         if self.calibration is not None:
-            answer = self.calibration.update(self.remote)
-            if answer is not None:
-                if answer.camera is not None:
-                    self._bent = answer.bent
-                    self._use_found(answer.camera, answer.motions)
+            said, answer = self.calibration.text, self.calibration.update(self.remote)
+            if answer is not None and answer.camera is not None:
+                self._use_found(answer.camera, answer.motions)
+            if self.calibration.text != said:
                 self.events.calibration(self.calibration.text)
 
     def _use_found(self, found: Camera, motions: Mapping[int, KeyframeMotion]) -> None:

@@ -172,12 +172,13 @@ def _plan(
 
 def _largest_segments(system: SlamSystem, sources: Sequence[Source]) -> list[int]:
     """The largest map segment of each run."""
-    keyframes = list(system.map.world.keyframes.values())
+    world = system.map.world
+    keyframes, mapped = list(world.keyframes.values()), world.mapped_segments()
     counts = Counter(k.segment for k in keyframes)
     numbers = _run_of(sources, [k.id for k in keyframes])
     runs = {k.segment: number for k, number in zip(keyframes, numbers, strict=True)}
     return [
-        max((s for s, run in runs.items() if run == n), key=lambda s: (counts[s], -s))
+        max((s for s, run in runs.items() if run == n), key=lambda s: (s in mapped, counts[s], -s))
         for n in range(len(sources))
     ]
 

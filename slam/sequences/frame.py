@@ -70,6 +70,8 @@ def check_frame(frame: Frame, camera: Camera, last_stamp_s: float = -math.inf) -
 
 def reduced_frame(frame: Frame, k: int) -> Frame:
     """A frame with images at a k-th of their size, NaN where depth is missing."""
+    if k == 1:
+        return frame
     depth_m = reduced_depth(frame.depth_m, k)
     depth_m[depth_m == 0] = np.nan
     return replace(frame, rgb=reduced_colour(frame.rgb, k), depth_m=depth_m)

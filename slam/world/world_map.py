@@ -17,7 +17,7 @@ from bmask_slam.world.keyframe import CulledKeyframe, Keyframe
 from bmask_slam.world.landmark_table import LandmarkTable, ends_of_chains
 from bmask_slam.world.observers import Observers
 
-MAX_CULLED = 500
+MAX_CULLED, MAPPED = 500, 0.05
 _COLUMNS = [f.name for f in fields(Features) if f.name != "gray"]
 
 
@@ -99,21 +99,28 @@ class WorldMap:
         return [k for k in self.keyframes.values() if k.segment == segment]
 
     def largest_segment(self) -> int:
-        """The segment with most keyframes, of those with landmarks if any; the older of equals."""
+        """The mapped segment with most keyframes, any if none is; the older of equal ones."""
         counts, mapped = Counter(k.segment for k in self.keyframes.values()), self.mapped_segments()
         return max(counts, key=lambda s: (s in mapped, counts[s], -s), default=0)
 
     def mapped_segments(self) -> set[int]:
-        """The segments that have landmarks."""
-        return set(self._segments(np.unique(self.landmarks.host[self.landmarks.in_map])))
+        """Those with landmarks; fewer than ``MAPPED`` of the most that one has are left-overs."""
+        found = self._segments(np.flatnonzero(self.landmarks.in_map))
+        return {s for s, count in found.items() if count >= MAPPED * max(found.values())}
 
     def segment_of(self, landmark_ids: Ints) -> int:
         """The segment whose keyframes made most of these landmarks."""
-        return int(np.bincount(self._segments(self.landmarks.host[landmark_ids])).argmax())
+        found = self._segments(landmark_ids)
+        return max(found, key=lambda segment: (found[segment], -segment))
 
-    def _segments(self, keyframe_ids: Ints) -> list[int]:
-        """Those of keyframes (N,), if they are in the map."""
-        return [self.keyframes[k].segment for k in keyframe_ids.tolist() if k in self.keyframes]
+    def _segments(self, landmark_ids: Ints) -> Counter[int]:
+        """How many landmarks the keyframes of each segment made."""
+        hosts, counts = np.unique(self.landmarks.host[landmark_ids], return_counts=True)
+        found: Counter[int] = Counter()
+        for host, count in zip(hosts.tolist(), counts.tolist(), strict=True):
+            if host in self.keyframes:
+                found[self.keyframes[host].segment] += count
+        return found
 
     def travelled(self) -> tuple[Ints, Array]:
         """Ids (K,) of all keyframes, ascending, and (K, 2) radians and metres of path up to each.
@@ -154,10 +161,7 @@ class WorldMap:
         self._refresh(keyframe, keypoints, landmark_ids)
 
     def mask(self, keyframe: Keyframe, keypoints: Ints) -> None:
-        """Record that keypoints (N,) of a keyframe lie on something that moves.
-
-        They observe nothing until they are unmasked.
-        """
+        """Keypoints (N,) of a keyframe lie on what moves: they observe nothing until ``unmask``."""
         keyframe.masked[keypoints] = True
         self.detach(keyframe, keypoints)
 

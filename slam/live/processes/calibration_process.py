@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +55,8 @@ from bmask_slam.world.world_map import WorldMap
 logger = logging.getLogger(__name__)
 
 BENT_SHARE = 1 / 40
-"""A map is bent where the image moves by this share of its width while depth is late."""
+"""Of its width: where the camera's turning, the median of all keyframes, moves the image so far
+while depth is late, the map is bent."""
 MAX_IMAGES = 80
 """Keyframes whose depth images are kept, 1.2 MB each at 640 x 480."""
 
@@ -145,9 +146,10 @@ class CalibrationServer:
         doubt = doubt or self._doubt(state, estimate)
         self._state, text = state, "; ".join(filter(None, (state.text, doubt)))
         shown = estimate is not None and estimate.shows(TIME, config)
-        known = shown or TIME not in setup.free or TIME in adopted_parameters(state)
+        told = TIME not in setup.free or setup.mode != "auto"
+        known = shown or told or TIME in adopted_parameters(state)
         last, clear = self._looks >= config.stretches, known and not doubt
-        if state.adopted and state.camera != run.camera:
+        if state.adopted and state.camera != replace(run.camera, covered=state.camera.covered):
             motions = self._motions(world, paths, run, state.camera)
             bent = _is_bent(world, run, state.camera)
             done = before.adopted or (state is by_motion and setup.camera.rolling_shutter_s != 0)

@@ -11,8 +11,10 @@ import logging
 import threading
 from dataclasses import dataclass
 
+from bmask_slam.calibration.camera_check import MAX_DELAY_S
 from bmask_slam.calibration.keyframe_depth import DepthImage, KeyframeImages
 from bmask_slam.graph.arrays import Array, Image
+from bmask_slam.graph.camera import Camera
 from bmask_slam.live.messages import CameraEstimated, EstimateCamera
 from bmask_slam.live.processes.calibration_process import CalibrationSetup
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
@@ -23,6 +25,8 @@ from bmask_slam.world.keyframe import Keyframe
 logger = logging.getLogger(__name__)
 
 NICENESS = 19
+READ_AHEAD = 10
+"""Frames at most that a source has made with the camera before."""
 TARGET = "bmask_slam.live.processes.calibration_process:serve_calibration"
 
 
@@ -58,6 +62,7 @@ class RemoteCalibration:
         self._awaited_save: int | None = None
         self._last: list[DepthImage] = []
         self._pending: _Pending | None = None
+        self._frames_left = 0  # until a bent map begins anew at last
 
     @property
     def pid(self) -> int:
@@ -82,6 +87,20 @@ class RemoteCalibration:
             pixels = keyframe.features.image_pixels
             rgb = (frame.rgb if self._sends_colour else frame.rgb[:0]).copy()
             self._pending = _Pending(keyframe.id, rgb, pixels, frame.depth_lag_s)
+
+    def begins_anew(self, frame: Frame, camera: Camera) -> bool:
+        """Whether the map, which the camera before has bent, begins anew with this frame.
+
+        With the first one whose depth is by the new camera, since some were read ahead, or after
+        ``READ_AHEAD`` others.
+        """
+        if not self._frames_left:
+            return False
+        self._frames_left -= 1
+        follows = abs(frame.depth_lag_s + camera.depth_time_offset_s) < MAX_DELAY_S
+        if follows:
+            self._frames_left = 0
+        return not self._frames_left
 
     def update(self, mapper: RemoteMapper) -> CameraEstimated | None:
         """Ask for an estimate when it is due; returns one that has come."""
@@ -117,6 +136,8 @@ class RemoteCalibration:
 
     def _answered(self, found: CameraEstimated) -> CameraEstimated:
         self.busy, self.text = False, found.text or self.text
+        if found.bent:
+            self._frames_left = READ_AHEAD
         logger.info("calibration: %s", found.text or "nothing new")
         if found.done:
             self.end()

@@ -245,3 +245,18 @@ def test_segment_joining() -> None:
     assert world.segment_of(np.concatenate([here, there])) == 1
     assert world.segment_of(np.concatenate([here, there[:1]])) == 0
     assert world.next_keyframe_id == 3
+
+
+def test_the_largest_segment_is_one_with_landmarks() -> None:
+    world = make_world(5)
+    for keyframe in world.keyframes.values():
+        keyframe.segment = int(keyframe.id >= 3)
+    rows = np.arange(COUNT)
+    assert world.mapped_segments() == set() and world.largest_segment() == 0
+    first, other = world.keyframes[0], world.keyframes[3]
+    ids = world.make_landmarks(first, rows, points_of(first, rows))
+    assert world.mapped_segments() == {0} and world.largest_segment() == world.segment_of(ids) == 0
+    world.make_landmarks(other, rows, points_of(other, rows))
+    assert world.mapped_segments() == {0, 1} and world.largest_segment() == 0
+    world.landmarks.remove(ids[1:])  # one is left over
+    assert world.mapped_segments() == {1} and world.largest_segment() == 1
