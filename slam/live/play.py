@@ -114,8 +114,8 @@ def _track(slam: LiveSlam, source: Source, frame: Frame, prepared: Prepared) -> 
     camera, images = slam.camera, (frame.rgb, frame.depth_m)
     result = slam.track(frame.timestamp_s, *images, prepared, frame.name, frame.depth_lag_s)
     if slam.camera != camera:
-        reduced = slam.camera.reduced_by == source.camera.reduced_by
-        source.use(slam.camera if reduced else slam.camera.recorded())
+        same_size = slam.camera.reduced_by == source.camera.reduced_by
+        source.use(slam.camera if same_size else slam.camera.recorded())
     return result
 
 

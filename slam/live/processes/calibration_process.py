@@ -55,8 +55,8 @@ from bmask_slam.world.world_map import WorldMap
 logger = logging.getLogger(__name__)
 
 BENT_SHARE = 1 / 40
-"""Of its width: where the camera's turning, the median of all keyframes, moves the image so far
-while depth is late, the map is bent."""
+"""Of the image's width: where the camera's turning, the median of all keyframes, moves the image
+farther than that while depth is late, the map is bent."""
 MAX_IMAGES = 80
 """Keyframes whose depth images are kept, 1.2 MB each at 640 x 480."""
 
@@ -146,9 +146,8 @@ class CalibrationServer:
         doubt = doubt or self._doubt(state, estimate)
         self._state, text = state, "; ".join(filter(None, (state.text, doubt)))
         shown = estimate is not None and estimate.shows(TIME, config)
-        told = TIME not in setup.free or setup.mode != "auto"
-        known = shown or told or TIME in adopted_parameters(state)
-        last, clear = self._looks >= config.stretches, known and not doubt
+        clear = not doubt and (shown or not self._lacks_delay(state))
+        last = self._looks >= config.stretches
         if state.adopted and state.camera != replace(run.camera, covered=state.camera.covered):
             motions = self._motions(world, paths, run, state.camera)
             bent = _is_bent(world, run, state.camera)
@@ -184,12 +183,15 @@ class CalibrationServer:
 
     def _doubt(self, state: SelfCalibration, estimate: Estimate | None) -> str:
         """A delay that is not sure enough to be adopted beside what was; "" if there is none."""
-        setup = self._setup
-        if estimate is None or not state.adopted or TIME not in setup.free:
+        if estimate is None or not state.adopted or not self._lacks_delay(state):
             return ""
-        if TIME in adopted_parameters(state) or not estimate.differs(TIME, setup.config):
-            return ""
-        return format_found(estimate, (TIME,), "not sure enough to be applied")
+        differs = estimate.differs(TIME, self._setup.config)
+        return format_found(estimate, (TIME,), "not sure enough to be applied") if differs else ""
+
+    def _lacks_delay(self, state: SelfCalibration) -> bool:
+        """Whether a delay that the motion shows would be used, and none was adopted."""
+        usable = self._setup.mode == "auto" and TIME in self._setup.free
+        return usable and TIME not in adopted_parameters(state)
 
     def _motions(
         self, world: WorldMap, paths: dict[int, Trajectory], run: SavedRun, camera: Camera

@@ -96,10 +96,8 @@ class RemoteCalibration:
         """
         if not self._frames_left:
             return False
-        self._frames_left -= 1
         follows = abs(frame.depth_lag_s + camera.depth_time_offset_s) < MAX_DELAY_S
-        if follows:
-            self._frames_left = 0
+        self._frames_left = 0 if follows else self._frames_left - 1
         return not self._frames_left
 
     def update(self, mapper: RemoteMapper) -> CameraEstimated | None:
