@@ -142,14 +142,10 @@ class SensorSystem(SystemResults, SensorInput):
         self._map_uses_camera(camera, motions)
 
     def leave_out(self, camera: Camera) -> None:
-        """Find nothing more in what this camera says is covered; nothing else may differ in it.
-
-        The map of before may have been bent by what is covered, so it begins anew.
-        """
+        """Find nothing more in what this camera says is covered; nothing else may differ in it."""
         self.camera = self.camera_tracker.tracker.camera = camera
         self.extractor.leave_out(camera)
         self.moving_objects.leave_out(camera)
-        self.begin_anew()
 
     def begin_anew(self) -> None:
         """Begin a segment with the next keyframe, apart from a map that is bent.

@@ -109,12 +109,17 @@ class LiveSystem(SlamSystem):
         return result
 
     def _found_covered(self, camera: Camera, text: str) -> None:
-        """Leave it out, if the camera is not only told about, in a segment that it has not bent."""
+        """Leave it out, if the camera is not only told about.
+
+        The map so far may be bent by it and begins anew, unless frames are only located in it.
+        """
         self.watch, adopts = None, self.calibration is None or self.calibration.adopts
         self.covered = with_verdict(text, adopts)
         self.events.calibration(self.covered)
         if adopts:
             self.leave_out(camera)
+        if adopts and self.remote.extends:
+            self.begin_anew()
 
     def _keyframe(self, result: FrameResult) -> Keyframe | None:
         """The keyframe that a frame has become, if it has."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from faults import LONG_S
+from feeding import track_frames
 from recorded_bags import DEPTH, INFO, RGB, BagMaker, image
 from shifted_stamps import with_depth_stamps
 
@@ -104,6 +106,19 @@ def test_a_robot_that_sees_itself_leaves_itself_out(robot, short_stretch, tmp_pa
     assert errors.value("ate_rmse") < 0.02
     told = played(robot, tmp_path / "told", "report")
     assert told.calibration.endswith("found, not left out") and not told.camera.covered
+
+
+def test_a_robot_that_is_only_located_keeps_its_map(robot) -> None:
+    there = list(robot.frames(stop=20))
+    back = [replace(f, timestamp_s=(20 + k) * STEP_S) for k, f in enumerate(there[::-1])]
+    seen = replace(robot.camera, covered=((0, 200, 320, 240),)), "a sixth never moves"
+    with LiveSlam(robot.camera, CONFIG, LiveOptions()) as slam:
+        track_frames(slam, there, waiting=0)
+        slam.extends = False
+        slam._system.watch = SimpleNamespace(look=lambda frame, camera: seen)
+        statuses = track_frames(slam, back)
+        assert slam.camera.covered and "left out" in slam.calibration
+    assert all(status.by_image for status in statuses)
 
 
 def test_a_map_that_late_depth_has_bent_begins_anew(
