@@ -25,3 +25,8 @@ def no_ids() -> Ints:
 def no_pairs() -> Ints:
     """No pairs of ids (0, 2)."""
     return np.zeros((0, 2), np.int64)
+
+
+def step_of(whole: int, kept: int) -> int:
+    """The step s of ``image[::s]``, which keeps ceil(whole / s) of an image's rows or columns."""
+    return -(-whole // max(kept, 1))

@@ -138,12 +138,14 @@ class SensorSystem(SystemResults, SensorInput):
         frames of unknown motion observe is forgotten.
         """
         reinterpret_frames(self.frame_observations, frame_motions or {}, self.camera, camera)
-        self.camera = self.camera_tracker.tracker.camera = camera
+        self.camera = camera
+        self.camera_tracker.use_camera(camera)
         self._map_uses_camera(camera, motions)
 
     def leave_out(self, camera: Camera) -> None:
         """Find nothing more in what this camera says is covered; nothing else may differ in it."""
-        self.camera = self.camera_tracker.tracker.camera = camera
+        self.camera = camera
+        self.camera_tracker.use_camera(camera)
         self.extractor.leave_out(camera)
         self.moving_objects.leave_out(camera)
 

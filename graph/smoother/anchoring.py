@@ -37,8 +37,9 @@ def anchor_loose(
 ) -> list[int]:
     """Anchor loose keyframes until none is left; returns the numbers of the factors added.
 
-    ``gone`` and ``edges`` are what was removed just before: each keyframe is anchored inside the
-    component that it was in then, to the firm keyframe that shared most with it.
+    ``removed`` (observations) and ``edges`` (pose factors) were removed just before: each keyframe
+    is anchored inside the component that it was in then, to the firm keyframe that shared most with
+    it.
     """
     added: list[int] = []
     before = _Before.of(removed, edges, tables) if len(loose) else None
@@ -104,15 +105,16 @@ def with_first_prior(
         return update
     first = int(np.argmin(update.keyframe_ids))
     keyframe, T_world_camera = int(update.keyframe_ids[first]), update.poses_world_camera[first]
-    return replace(update, priors=(_firm_prior(keyframe, T_world_camera, config),))
+    return replace(update, priors=(firm_prior(keyframe, T_world_camera, config),))
 
 
 def prior_here(keyframe: int, tables: FactorTables, config: SmootherConfig) -> PosePrior:
     """A prior at a keyframe's current estimate, with the sigmas of the first pose's prior."""
-    return _firm_prior(keyframe, tables.keyframes.get(np.array([keyframe]))[0], config)
+    return firm_prior(keyframe, tables.keyframes.get(np.array([keyframe]))[0], config)
 
 
-def _firm_prior(keyframe: int, T_world_camera: Array, config: SmootherConfig) -> PosePrior:
+def firm_prior(keyframe: int, T_world_camera: Array, config: SmootherConfig) -> PosePrior:
+    """A prior with the sigmas of the first pose's: it fixes a coordinate frame."""
     covariance = diagonal_covariance(
         config.prior_sigma_rotation_rad, config.prior_sigma_translation_m
     )
@@ -121,7 +123,14 @@ def _firm_prior(keyframe: int, T_world_camera: Array, config: SmootherConfig) ->
 
 def weak_between(a: int, b: int, tables: FactorTables, config: SmootherConfig) -> RelativePose:
     """A weak between factor of two keyframes at their current estimates."""
-    T_world_a, T_world_b = tables.keyframes.get(np.array([a, b]))
+    return anchor_between(a, b, tables.keyframes.get(np.array([a, b])), config)
+
+
+def anchor_between(
+    a: int, b: int, T_world_keyframes: Array, config: SmootherConfig
+) -> RelativePose:
+    """A weak between factor of two keyframes at these poses (2, 4, 4)."""
+    T_world_a, T_world_b = T_world_keyframes
     covariance = diagonal_covariance(
         config.anchor_sigma_rotation_rad, config.anchor_sigma_translation_m
     )

@@ -251,8 +251,8 @@ class Smoother:
         loose, later ones the named variable too.
         """
         report.rebuilt = True
-        found = solve_without_own(failure, report.new_own, self._tables, solve)
-        report.failed_own, left = found
+        removed, left = solve_without_own(failure, report.new_own, self._tables, solve)
+        report.failed_own += removed
         if left is None:
             return True
         failure = left

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Array, Bytes, Floats, Ints, Mask
+from bmask_slam.graph.arrays import Array, Bytes, Floats, Ints, Mask, step_of
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.beliefs.vote_config import VoteConfig
 from bmask_slam.semantics.instances.instances import Instance, mask_box, painting_order
@@ -119,7 +119,7 @@ def _surfaces(
     owner: NDArray[np.int16], inner: Mask, depth_m: Floats, count: int, config: VoteConfig
 ) -> Array:
     """Depth range (K, 2) of each instance's surface: median and MAD of its inner pixels."""
-    step = owner.shape[0] // max(depth_m.shape[0], 1)
+    step = step_of(owner.shape[0], depth_m.shape[0])
     coarse = owner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]]
     usable = inner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]] & (coarse != NO_INSTANCE)
     usable &= np.isfinite(depth_m[: coarse.shape[0], : coarse.shape[1]])

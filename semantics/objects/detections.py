@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
+from bmask_slam.graph.arrays import Array, Floats, Ints, Mask, step_of
 from bmask_slam.semantics.beliefs.pixel_assignment import NO_INSTANCE, PixelAssignment
 
 _COARSE = 4
@@ -68,7 +68,7 @@ def detect(
     ``depth_m`` (h, w) is every s-th pixel of the image in both directions, ``rays`` (h, w, 3) the
     camera-frame points of these pixels at a depth of 1 m.
     """
-    step = assignment.owner.shape[0] // depth_m.shape[0]
+    step = step_of(assignment.owner.shape[0], depth_m.shape[0])
     height, width = depth_m.shape
     owner = _without_border(assignment, config)[::step, ::step][:height, :width]
     rows, columns = np.nonzero((owner != NO_INSTANCE) & np.isfinite(depth_m))

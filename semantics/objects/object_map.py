@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask, step_of
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.geometry import inverse, transform
@@ -197,7 +197,7 @@ class ObjectMap:
         self, view: KeyframeView, found: Detections, points: Array, pixels: Ints
     ) -> tuple[Ints, Mask]:
         """The detection (N,) that covers each object point, -1 for none; which are visible (N,)."""
-        step = self.camera.height // view.depth_m.shape[0]
+        step = step_of(self.camera.height, view.depth_m.shape[0])
         limits = np.array(view.depth_m.shape) - 1
         rows, columns = np.minimum(pixels[:, ::-1] // step, limits).T
         depth_m = view.depth_m[rows, columns].astype(float)

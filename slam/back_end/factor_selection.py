@@ -7,18 +7,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bmask_slam.back_end.factors import anchor, observations_of, segment_prior
+from bmask_slam.back_end.factors import anchor, observations_of
 from bmask_slam.features.brisk import spread_order
 from bmask_slam.graph.arrays import Arrays, Ints, Mask
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
-from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, concatenate
+from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, PosePrior, concatenate
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.smoother.anchoring import firm_prior
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
 MANY_BATCHES = 300
-"""Of landmarks that wait to be marginalised: so many do not while a run goes on, nor when the map
-has outgrown ``full_keyframes``, from which on they wait."""
+"""If more batches than these wait to be marginalised, all are at once. So many never gather in a
+running session: it is a large map, opened again after its last optimisation put them all back."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ class FactorSelector:
             poses_world_camera=keyframe.T_world_camera[None],
             landmark_ids=new_ids,
             points_world=world.landmarks.points_world[new_ids],
-            priors=(segment_prior(keyframe),) if last is None else (),
+            priors=() if last is not None else (self._prior(keyframe),),
             relative_poses=anchors,
             marginalise_landmarks=marginalised,
         )
@@ -171,8 +172,12 @@ class FactorSelector:
             landmark_ids=ids,
             points_world=landmarks.points_world[ids],
             observations=self._unsent_observations(world),
-            priors=tuple(segment_prior(first[s]) for s in sorted(first)),
+            priors=tuple(self._prior(first[s]) for s in sorted(first)),
         )
+
+    def _prior(self, keyframe: Keyframe) -> PosePrior:
+        """The first keyframe of a segment fixes the segment's frame."""
+        return firm_prior(keyframe.id, keyframe.T_world_camera, self._graph)
 
     def _promoted(
         self, world: WorldMap, keyframe: Keyframe, keypoints: Ints, ids: Ints, already: int

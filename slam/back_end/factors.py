@@ -7,15 +7,12 @@ import numpy as np
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.factors.graph_update import (
-    ANCHOR,
     Observations,
-    PosePrior,
     RelativePose,
     concatenate,
 )
-from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.graph.geometry import inverse
+from bmask_slam.graph.smoother.anchoring import anchor_between
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
@@ -25,11 +22,7 @@ def anchor(a: Keyframe, b: Keyframe, config: SmootherConfig) -> RelativePose:
 
     The smoother releases it when it is not needed.
     """
-    covariance = diagonal_covariance(
-        config.anchor_sigma_rotation_rad, config.anchor_sigma_translation_m
-    )
-    T_a_b = inverse(a.T_world_camera) @ b.T_world_camera
-    return RelativePose(a.id, b.id, T_a_b, covariance, kind=ANCHOR)
+    return anchor_between(a.id, b.id, np.stack([a.T_world_camera, b.T_world_camera]), config)
 
 
 def sent_observations(world: WorldMap, depth_factor: float) -> Observations:
@@ -41,11 +34,6 @@ def sent_observations(world: WorldMap, depth_factor: float) -> Observations:
         )
         parts.append(observations_of(keyframe, rows, keyframe.sent_ids[rows], depth_factor))
     return concatenate(parts)
-
-
-def segment_prior(keyframe: Keyframe) -> PosePrior:
-    """The first keyframe of a segment fixes the segment's frame."""
-    return PosePrior(keyframe.id, keyframe.T_world_camera, np.eye(6) * 1e-8)
 
 
 def observations_of(

@@ -60,7 +60,7 @@ def can_join(
     _, nearest = world.covisible(recognised.landmark_ids, 1)[0]
     own = world.in_segment(segment)
     before = [k for k in world.in_segment(nearest.segment) if k.id < own[0].id]
-    if not before or before[-1].timestamp_s > (begin_s := own[0].timestamp_s):
+    if not before or not before[-1].timestamp_s < (begin_s := own[0].timestamp_s):
         return True  # there is none, or it is of another recording
     frames = back_end.history.path(world, nearest.segment, before[-1].timestamp_s, begin_s)
     stamps_s = np.append(before[-1].timestamp_s, frames.timestamps_s)

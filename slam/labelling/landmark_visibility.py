@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
+from bmask_slam.graph.arrays import Array, Floats, Ints, Mask, step_of
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.world.keyframe import Keyframe
@@ -149,7 +149,7 @@ def visible_landmarks(
     inside = ((whole >= 0) & (whole < [camera.width, camera.height])).all(axis=1)
     views, rows, pixels = views[inside], rows[inside], pixels[inside]
     size = seen_from.depth_m.shape[1:]
-    nearest = whole[inside, ::-1].astype(np.int64) // (camera.height // size[0])
+    nearest = whole[inside, ::-1].astype(np.int64) // step_of(camera.height, size[0])
     v, u = np.moveaxis(np.clip(nearest[:, None] + _NINE, 0, np.array(size) - 1), -1, 0)
     z_m = local[views, rows, 2]
     apart_m = np.abs(seen_from.depth_m[views[:, None], v, u] - z_m[:, None])

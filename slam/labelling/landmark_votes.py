@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
+from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask, step_of
 from bmask_slam.graph.camera import Camera
 from bmask_slam.labelling.landmark_visibility import (
     Observed,
@@ -124,7 +124,7 @@ class LabelVotes:
         camera, store = self._camera, self._labels
         if not len(sightings.landmark_ids):
             return sightings.landmark_ids
-        scale = camera.width // stack.owner.shape[2]
+        scale = step_of(camera.width, stack.owner.shape[2])
         config = replace(self._config, edge_px=-(-self._config.edge_px // scale))
         pixels, z_m = sightings.pixels / scale, sightings.z_m
         votes = vote_in_views(stack, sightings.views, pixels, z_m, config)

@@ -60,7 +60,7 @@ class LiveMap(SensorInput):
     def catch_up(self, waiting: float = math.inf) -> None:
         """Apply the other processes' results; wait until at most ``waiting`` keyframes are pending.
 
-        The wait ends after ``MAX_MAP_WAIT_S`` in any case.
+        The wait ends after ``MAX_MAP_WAIT_S``, unless the camera is being estimated.
         """
         self._system.wait_for_map(waiting, MAX_MAP_WAIT_S)
 

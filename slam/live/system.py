@@ -109,17 +109,14 @@ class LiveSystem(SlamSystem):
         return result
 
     def _found_covered(self, camera: Camera, text: str) -> None:
-        """Leave it out, if the camera is not only told about.
-
-        The map so far may be bent by it and begins anew, unless frames are only located in it.
-        """
+        """Leave it out, if the camera is not only told about; a map that grows begins anew."""
         self.watch, adopts = None, self.calibration is None or self.calibration.adopts
         self.covered = with_verdict(text, adopts)
         self.events.calibration(self.covered)
         if adopts:
             self.leave_out(camera)
-        if adopts and self.remote.extends:
-            self.begin_anew()
+            if self.remote.extends:  # the map so far may be bent by it
+                self.begin_anew()
 
     def _keyframe(self, result: FrameResult) -> Keyframe | None:
         """The keyframe that a frame has become, if it has."""

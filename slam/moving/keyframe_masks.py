@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
+from bmask_slam.graph.arrays import Array, Floats, Ints, Mask, step_of
 from bmask_slam.graph.camera import Camera
 from bmask_slam.moving.free_space_check import thinned_view
 from bmask_slam.semantics.beliefs.pixel_assignment import PixelAssignment
@@ -43,7 +43,7 @@ class KeyframeMasks:
     @property
     def step(self) -> int:
         """Pixels from one depth to the next."""
-        return max(self.assignment.owner.shape[0] // max(self.depth_m.shape[0], 1), 1)
+        return step_of(self.assignment.owner.shape[0], self.depth_m.shape[0])
 
 
 @dataclass(frozen=True, eq=False)

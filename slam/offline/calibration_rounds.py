@@ -54,7 +54,9 @@ def calibrate_in_rounds(options: CalibrateOptions, rounds: int, quiet: bool = Fa
         for k in range(2, rounds + 1):
             logger.info("calibrated %d of %d times; running again", k - 1, rounds)
             again = folder / f"run-{k}"
-            run(_again(options.run, sequence, done.path, again, quiet))
+            used = _again(options.run, sequence, done.path, again)
+            full_size = before.reduced_by == 1
+            run(dataclasses.replace(used, quiet=quiet, full_size=full_size))
             camera = folder / f"camera-{k}.yaml"
             earlier, done = (
                 done,
@@ -68,7 +70,7 @@ def calibrate_in_rounds(options: CalibrateOptions, rounds: int, quiet: bool = Fa
     return done
 
 
-def _again(before: Path, sequence: Path, camera: Path, out: Path, quiet: bool) -> RunOptions:
+def _again(before: Path, sequence: Path, camera: Path, out: Path) -> RunOptions:
     """Options for the same frames and configuration with another camera."""
     config = before / "config.yaml"
     frames = frame_stamps(before / "trajectory.txt")
@@ -80,5 +82,4 @@ def _again(before: Path, sequence: Path, camera: Path, out: Path, quiet: bool) -
         max_frames=None if frames is None else len(frames),
         stride=read_origin(before).stride,
         calibrate="off",
-        quiet=quiet,
     )

@@ -72,9 +72,11 @@ class MapLocalisation(SlamSystem):
         if tracked.status is TrackingStatus.LOST:
             return None
         T, ids, world = tracked.T_world_camera, tracked.landmark_ids, self.map.world
+        self._located.append((frame.timestamp_s, T))
+        if not tracked.status.by_image:
+            return T
         self.camera_tracker.remember(tracked.features, tracked.landmark_of, T)
         self.camera_tracker.update_motion(T, T, ids)
-        self._located.append((frame.timestamp_s, T))
         self._frames_since_refresh += 1
         outside = not np.isin(ids, self.camera_tracker.local_ids).all()
         if outside or self._frames_since_refresh >= REFRESH_FRAMES:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from bmask_slam.features.brisk import BriskExtractor, Features
-from bmask_slam.graph.arrays import Array, Arrays, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Ints, no_ids
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.geometry import inverse, orthonormalised
 from bmask_slam.sequences.frame import Frame
@@ -45,8 +46,7 @@ class CameraTracker:
         self._map = map_reader
         self._relocalisation, self._local_map = relocalisation, local_map
         self.motion = MotionModel()
-        self._recent_ids: Ints = np.zeros(0, np.int64)
-        self.local_ids: Ints = np.zeros(0, np.int64)
+        self._recent_ids, self.local_ids = no_ids(), no_ids()
         self._images = GuidedLandmarks(extractor, tracker.config.image_motion)
 
     def state(self) -> Arrays:
@@ -65,6 +65,11 @@ class CameraTracker:
         self.motion.restore(state)
         self._recent_ids, self.local_ids = state["recent_ids"], state["local_ids"]
         self._images.restore(part(state, "images"))
+
+    def use_camera(self, camera: Camera) -> None:
+        """Go on with another camera."""
+        self.tracker.camera = camera
+        self._images.use_camera(camera)
 
     @property
     def timestamp_s(self) -> float:
@@ -85,7 +90,7 @@ class CameraTracker:
     def reset(self, lost_frames: int) -> None:
         """Lost for so many frames, with no knowledge of where the camera is."""
         self.lost_frames = lost_frames
-        self._recent_ids = self.local_ids = np.zeros(0, np.int64)
+        self._recent_ids, self.local_ids = no_ids(), no_ids()
         self._images.forget()
         self.restart(np.eye(4))
 
@@ -110,12 +115,12 @@ class CameraTracker:
             self._follow(features)
 
     def prediction(self) -> Array | None:
-        """T_world_camera (4, 4) of the next frame by constant velocity; None without a pose."""
+        """T_world_camera (4, 4) by optical flow, else by velocity; None while lost without flow."""
         unknown = self.lost_frames and self._images.followed is None
         return None if unknown or self.reference is None else self._predicted()
 
     def preview(self, features: Features) -> Array | None:
-        """The pose that ``track`` would find, None if it would find none; no state is changed."""
+        """The frame's pose by the local map alone, None if not found; no state is changed."""
         tracked = self._tracked(features, self._map.world.landmarks.remaining(self.local_ids))
         return None if tracked.status is TrackingStatus.LOST else tracked.T_world_camera
 
@@ -204,16 +209,14 @@ class CameraTracker:
         rules = self._relocalisation, self._local_map
         return relocalise(features, keyframes, self._map, self.tracker, *rules)
 
-    def update_motion(
-        self, T_world_tracked: Array, T_world_camera: Array, landmark_ids: Ints
-    ) -> None:
+    def update_motion(self, T_world_tracked: Array, T_world_camera: Array, ids: Ints) -> None:
         """Set the pose that the next frame is predicted from.
 
-        T_world_tracked is the pose as tracked, T_world_camera as optimised; the landmarks (N,) are
-        those that the frame observes.
+        T_world_tracked is the pose as tracked, T_world_camera as optimised; ``ids`` (N,) are the
+        landmarks that the frame observes.
         """
         self.motion.advance(T_world_tracked, T_world_camera, steady=self.lost_frames == 0)
-        self._recent_ids = landmark_ids
+        self._recent_ids = ids
         self.lost_frames = 0
 
     def remember(self, features: Features, landmark_ids: Ints, T_world_camera: Array) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from bmask_slam.features.brisk import BriskExtractor, Features, select
 from bmask_slam.features.matching import Matches
 from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
+from bmask_slam.graph.camera import Camera
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.image_motion import (
     Followed,
@@ -104,6 +105,10 @@ class GuidedLandmarks:
         self._last = nothing_seen()
         self._extractor = extractor
         self._motion = ImageMotion(extractor.camera, config)
+
+    def use_camera(self, camera: Camera) -> None:
+        """Follow corners as another camera sees them move."""
+        self._motion.camera = camera
 
     @property
     def needed(self) -> bool:

@@ -187,8 +187,8 @@ class MapServer:
         """Save the state; messages up to this number are then not needed any more."""
         try:
             self._write(path)
-        except OSError as error:  # a later state may be written
-            logger.warning("%s: cannot be written (%s)", path, error.strerror)
+        except InputError as error:  # a later state may be written
+            logger.warning("%s", error)
         else:
             self._send(StateSaved(number, path))
         give_back_memory()  # of the state, and of what the graph has changed since

@@ -44,6 +44,7 @@ class MapWorker:
         losses: how often the workstation was lost.
         state: the file of the last saved state, None before the first.
         saves: how many states were saved.
+        saved: number of the last message that the last state contains.
         sent: the number of the last message.
     """
 
@@ -65,7 +66,7 @@ class MapWorker:
         self._place = place
         self._arguments, self._replacement = arguments, replacement
         self.state = place.begins_with
-        self.saves = self._saved = 0  # messages that the last state contains
+        self.saves = self.saved = 0
         self._return: MapReturn | None = None
         self._early: list[Any] = []
         self._standby: WorkerEnd | None = None  # in place of the workstation
@@ -216,7 +217,7 @@ class MapWorker:
             if self._return is not None:
                 self._return.close()
             self._return = self._way_back(self._place.workstation)
-        self._send_journal(self._saved)
+        self._send_journal(self.saved)
 
     def _send_journal(self, begin: int) -> None:
         """Send the messages after one of this number."""
@@ -279,7 +280,7 @@ class MapWorker:
             going.has_state(message.number)
             return
         self.state, self._crashes_in_a_row = message.path, 0
-        self._saved = message.number
+        self.saved = message.number
         self.saves += 1
         kept = None if going is None else going.saved
         last = message.number if kept is None else min(message.number, kept)

@@ -59,7 +59,7 @@ class RemoteCalibration:
         self._sends_colour = setup.looks_at_edges
         self._worker = Worker("calibration", TARGET, setup, NICENESS)
         self._frames = 0
-        self._awaited_save: int | None = None
+        self._asked: int | None = None  # the number of the message that asks for a state
         self._last: list[DepthImage] = []
         self._pending: _Pending | None = None
         self._frames_left = 0  # until a bent map begins anew at last
@@ -104,14 +104,12 @@ class RemoteCalibration:
         """Ask for an estimate when it is due; returns one that has come."""
         if self.done:
             return None
-        saves, state = mapper.saved
         if not self.busy and self._frames >= self._due:
-            self.busy, self._awaited_save = True, saves + 1
             self._due *= 2
             mapper.save_state()
-        if self._awaited_save is not None and saves >= self._awaited_save and state is not None:
-            self._awaited_save = None
-            self._worker.send(EstimateCamera(state))
+            self.busy, self._asked = True, mapper.worker.sent
+        if self._asked is not None:
+            self._begin_estimate(mapper, self._asked)
         for message in self._worker.receive():
             match message:
                 case CameraEstimated():
@@ -122,6 +120,17 @@ class RemoteCalibration:
             logger.warning("the calibration's process died; the camera stays as it is")
             self.end()
         return None
+
+    def _begin_estimate(self, mapper: RemoteMapper, asked: int) -> None:
+        """Send the state that was asked for, once it is there; if it cannot come, give it up."""
+        worker = mapper.worker
+        is_skipped = mapper.given_up or not worker.lacks(asked - 1, asked)
+        if worker.saved >= asked and worker.state is not None:
+            self._asked = None
+            self._worker.send(EstimateCamera(worker.state))
+        elif mapper.handled >= asked or is_skipped:
+            logger.warning("calibration: the map's state was not saved; it is tried again later")
+            self._asked, self.busy = None, False
 
     def end(self) -> None:
         """End the process, without waiting for it."""

@@ -68,6 +68,7 @@ class RemoteMapper:
         update_ms: time that the process took for each keyframe.
         changes: how often the copy was updated.
         reference: the keyframe that tracking refers to; set before ``insert``.
+        handled: number of the last message that the process has handled.
         worker: the process that owns the map.
         objects: as the process told them last; None before.
         maps_saved: answers to ``SaveMap``, which their reader removes.
@@ -83,7 +84,7 @@ class RemoteMapper:
         self.events = EventLog()
         self.sensors = SensorFusion(config.sensors, EventLog())  # the process reports
         self.update_ms: list[float] = []
-        self.loops_closed = self.changes = 0
+        self.loops_closed = self.changes = self.handled = 0
         self.reference: Keyframe | None = None
         self._folder, self._has_labels = place.folder, len(names) > 1
         self.objects: MapObjects | None = None
@@ -195,11 +196,6 @@ class RemoteMapper:
         """Let the process save its state, from which it can be started again."""
         self.send(SaveState(self._folder / ".live-state"))
 
-    @property
-    def saved(self) -> tuple[int, Path | None]:
-        """How many states were saved, and the file of the last."""
-        return self.worker.saves, self.worker.state
-
     def catch_up(self, timeout_s: float = 0.0) -> list[Any]:
         """Apply the process's answers to the copy; waits at most so long for the first.
 
@@ -224,7 +220,9 @@ class RemoteMapper:
                     self.objects, self._asked = message.objects, False
                 case MapSaved():
                     self.maps_saved.append(message)
-                case _ if not isinstance(message, Handled):
+                case Handled():
+                    self.handled = message.number
+                case _:
                     others.append(message)
         return others
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bmask_slam.datasets.weights import find_weights
@@ -129,8 +129,8 @@ class RemoteSegmenter:
         return keyframe_id in self._requested
 
     def request(self, image: ImageToSegment) -> None:
-        """Request the masks of a keyframe; returns at once."""
-        begins = not self._requested
+        """Request the masks of a keyframe, whose image is copied; returns at once."""
+        begins, image = not self._requested, replace(image, rgb=image.rgb.copy())
         self._requested[image.keyframe_id] = image
         if len(self._requested) > MAX_KEPT:  # of a process that is away
             del self._requested[next(iter(self._requested))]

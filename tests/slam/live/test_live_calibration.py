@@ -16,17 +16,21 @@ from faults import LONG_S
 from feeding import track_frames
 from recorded_bags import DEPTH, INFO, RGB, BagMaker, image
 from shifted_stamps import with_depth_stamps
+from synthetic_view import CAMERA
 
 from bmask_slam.calibration.adoption import SelfCalibrationConfig
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation.ate_rpe import evaluate_trajectory
 from bmask_slam.events import EventKind
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.live import live_map, start, system
 from bmask_slam.live import play as play_module
 from bmask_slam.live.live_slam import LiveSlam
+from bmask_slam.live.messages import EstimateCamera
 from bmask_slam.live.play import PlayOptions, play
 from bmask_slam.live.processes import remote_calibration
+from bmask_slam.live.processes.calibration_process import CalibrationSetup
 from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.source import RecordedSource
 from bmask_slam.live.start import LiveOptions
@@ -199,3 +203,28 @@ def test_a_recording_goes_on_with_the_camera_that_is_found(late_sweep, sweep_cam
 def test_an_unknown_choice_is_refused() -> None:
     with pytest.raises(InputError, match="--calibrate on: is not one of auto, report, off"):
         LiveOptions(calibrate="on")
+
+
+@pytest.mark.parametrize("end", ["not written", "skipped", "given up", "written"])
+def test_an_estimate_whose_map_was_not_saved_is_given_up(monkeypatch, end: str) -> None:
+    sent: list[object] = []
+    process = SimpleNamespace(is_running=True, receive=lambda: [], send=sent.append)
+    monkeypatch.setattr(remote_calibration, "Worker", lambda *about: process)
+    config = SelfCalibrationConfig(frames=0)
+    setup = CalibrationSetup(CAMERA, SmootherConfig(), config, "report", (), pairs=False)
+    worker = SimpleNamespace(sent=7, saved=3, state=Path("old"), lacks=lambda after, last: True)
+    mapper = SimpleNamespace(worker=worker, handled=6, given_up=False, save_state=lambda: None)
+    calibration = remote_calibration.RemoteCalibration(setup)
+    calibration.update(mapper)  # asks for a state, by message 7
+    calibration.update(mapper)
+    assert calibration.busy and not sent
+    if end == "skipped":
+        worker.lacks = lambda after, last: (after, last) != (6, 7)
+    elif end == "given up":
+        mapper.given_up = True
+    else:
+        mapper.handled, worker.saved = 7, 7 if end == "written" else 3
+    monkeypatch.setattr(calibration, "_due", 1)
+    calibration.update(mapper)
+    assert calibration.busy == (end == "written")
+    assert sent == ([EstimateCamera(Path("old"))] if end == "written" else [])

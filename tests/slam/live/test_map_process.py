@@ -16,12 +16,14 @@ from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.graph.smoother.storage import read_camera
 from bmask_slam.live.messages import (
     STATE_FILE,
+    Handled,
     LostKeyframe,
     MapChanged,
     NewKeyframe,
     PruneMask,
     RestoreObservations,
     SaveState,
+    Started,
     UseCamera,
     VisibilityCounts,
 )
@@ -137,3 +139,12 @@ def test_another_camera_reaches_the_map_its_keyframes_and_the_saved_state(tmp_pa
     server.handle(2, SaveState(tmp_path / "state"))
     header, _ = read_arrays(tmp_path / "state", STATE_FILE)
     assert read_camera(header, tmp_path) == found
+
+
+def test_a_state_that_cannot_be_written_is_done_without(tmp_path, caplog) -> None:
+    answers: list[Any] = []
+    server = MapServer(SlamSystem(CAMERA, SystemConfig()), answers.append)
+    path = tmp_path / "missing/state"
+    server.handle(1, SaveState(path))
+    assert answers == [Started(1), Handled(1)]
+    assert str(path) in caplog.text
