@@ -102,12 +102,19 @@ def test_landmarks_at_one_keypoint_are_fused() -> None:
 
 @pytest.mark.parametrize(
     ("gap_s", "apart_m", "possible"),
-    [(0.1, 0.2, True), (0.1, 3.0, False), (1.5, 3.0, True), (-60.0, 3.0, True)],
+    [
+        (0.1, 0.2, True),
+        (0.1, 3.0, False),
+        (1.5, 3.0, True),
+        (-60.0, 3.0, True),
+        (0.0, 3.0, True),
+        (np.nan, 3.0, True),
+    ],
 )
 def test_segments_are_joined_where_the_camera_can_have_come_in_time(
     gap_s: float, apart_m: float, possible: bool
 ) -> None:
-    """0.5 m, and 3 m/s; stamps that go back are of another recording."""
+    """0.5 m, and 3 m/s; stamps that do not go on, or are unknown, are of another recording."""
     world, _, second = two_segments()
     old, new = world.keyframes.values()
     new.timestamp_s = old.timestamp_s + gap_s

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 from synthetic_view import CAMERA
 
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
@@ -25,16 +27,18 @@ def world(points_world: np.ndarray) -> Any:
     return SimpleNamespace(landmarks=landmarks, in_segment=in_segment)
 
 
-def test_landmarks_on_the_measured_surface_are_visible() -> None:
+@pytest.mark.parametrize("size", [(CAMERA.width, CAMERA.height), (501, 375)])
+def test_landmarks_on_the_measured_surface_are_visible(size: tuple[int, int]) -> None:
     rng = np.random.default_rng(0)
+    camera = replace(CAMERA, width=size[0], height=size[1])
     local = rng.uniform([-2, -2, -3], [2, 2, 5], (600, 3))
-    depth_m = rng.uniform(1.0, 4.0, (CAMERA.height // 2, CAMERA.width // 2)).astype(np.float32)
+    depth_m = rng.uniform(1.0, 4.0, size[::-1])[::2, ::2].astype(np.float32)
     depth_m[:, ::7] = np.nan
     expected = {}
     for i, (x, y, z) in enumerate(local):
-        u, v = CAMERA.fx * x / z + CAMERA.cx, CAMERA.fy * y / z + CAMERA.cy
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         column, row = round(u), round(v)
-        if z > 0.1 and 0 <= column < CAMERA.width and 0 <= row < CAMERA.height:
+        if z > 0.1 and 0 <= column < camera.width and 0 <= row < camera.height:
             if i % 2:  # half of them on the surface
                 local[i] *= depth_m[row // 2, column // 2] * 1.01 / z
             top, left = max(row // 2 - 1, 0), max(column // 2 - 1, 0)
@@ -44,7 +48,7 @@ def test_landmarks_on_the_measured_surface_are_visible() -> None:
     first = min(expected)  # was matched, two pixels off
     pixels = np.array([expected[first][:2]]) + 2.0
     matched = VisibleLandmarks(pixels, local[[first], 2], np.array([first]), POSE, 2)
-    found = matched.with_visible(depth_m, CAMERA, world(transform(POSE, local)))
+    found = matched.with_visible(depth_m, camera, world(transform(POSE, local)))
     others = sorted(set(expected) - {first, 598, 599})
     assert len(others) > 50
     assert found.landmark_ids.tolist() == [first, *others]

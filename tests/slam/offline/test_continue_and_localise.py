@@ -120,6 +120,21 @@ def test_localisation_finds_every_frame_and_changes_nothing(state: Arrays) -> No
     assert len(system.keyframe_trajectory()) == 0
 
 
+def test_odometry_leads_on_where_the_map_does_not_show(state: Arrays) -> None:
+    system = started(state, MapLocalisation)
+    poses = sideways(20, -1.55, 0.03)
+    frames = [render_plane(pose, k) for k, pose in enumerate(poses)]
+    for k in range(6, 14):
+        frames[k] = replace(frames[k], rgb=np.zeros_like(frames[k].rgb))
+    system.add_odometry([f.timestamp_s for f in frames], np.array(poses))
+    results = [system.process(frame) for frame in frames]
+    by_odometry = [TrackingStatus.DEAD_RECKONING] * 8
+    assert [r.status for r in results[6:14]] == by_odometry
+    assert {r.status for r in results[:6] + results[14:]} == {TrackingStatus.OK}
+    assert largest_error_m(results, poses) < 0.005
+    assert len(system.trajectory()) == 20
+
+
 def part_of_state(state: Arrays) -> Arrays:
     """The map without search counters of landmarks."""
     counters = ("visible", "found")
