@@ -12,6 +12,7 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import DepthNoise
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
 from bmask_slam.graph.factors.graph_update import ANCHOR, GraphUpdate
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.world.world_map import WorldMap
@@ -118,6 +119,15 @@ def test_a_landmark_is_added_at_its_second_observation_with_all() -> None:
     assert pairs(second) == {(k, i) for k in (0, 1) for i in range(10)}
     assert second.priors == ()
     np.testing.assert_array_equal(second.points_world, world.landmarks.points_world[:10])
+
+
+def test_the_frame_of_a_segment_is_as_firm_as_configured() -> None:
+    world, _ = make_world(1)
+    graph = SmootherConfig(prior_sigma_rotation_rad=2e-3, prior_sigma_translation_m=3e-3)
+    selector = FactorSelector(EVERYTHING, graph=graph)
+    (prior,) = selector.keyframe_update(world, world.keyframes[0]).priors
+    sigmas = np.repeat([2e-3, 3e-3], 3)
+    np.testing.assert_allclose(prior.covariance, np.diag(sigmas**2))
 
 
 def test_every_observation_is_sent_exactly_once() -> None:

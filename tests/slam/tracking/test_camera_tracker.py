@@ -204,3 +204,10 @@ def test_landmarks_ahead_of_the_map_are_tracked_where_the_map_ends(hidden: int, 
     camera_tracker.refer_to(keyframe)
     shown = make_features(np.eye(4), points[:75], seen.descriptors[:75])
     assert len(camera_tracker.track(shown).landmark_ids) == used
+
+
+def test_optical_flow_uses_the_camera_that_was_found() -> None:
+    camera_tracker, tracker, _ = scene()
+    found = replace(CAMERA, rolling_shutter_s=0.02)
+    camera_tracker.use_camera(found)
+    assert tracker.camera == camera_tracker._images._motion.camera == found
