@@ -217,7 +217,7 @@ class SlamSystem(SavedSystem):
         It does not if observations were restored after it was tracked, since the decision compares
         the tracked landmarks with those of the map.
         """
-        reason = "" if restored else self.keyframes.reason(tracked)
+        reason = "" if restored else self.keyframes.decide(tracked)
         if not reason:
             return tracked, None, ""
         begin_early(self.semantics.segmenter, frame.rgb, frame.name)
@@ -233,7 +233,7 @@ class SlamSystem(SavedSystem):
     @stage("loops")
     def _close_loops(self, keyframe: Keyframe) -> None:
         self.map.close_loops(keyframe)
-        self.keyframes.frames_since = 0
+        self.keyframes.made()
         self.camera_tracker.refer_to(keyframe)
 
     @stage("semantics")

@@ -67,7 +67,7 @@ class SavedSystem(SensorSystem):
 
     def begin_session(self) -> None:
         """Go on with the map in another recording; nothing else is kept."""
-        self.keyframes.frames_since = 0
+        self.keyframes.made()
         self._first_keyframe = self.map.world.next_keyframe_id
         self.mapper.begin_session()
         self.semantics.begin_session()

@@ -117,14 +117,14 @@ class Observed(SlamSystem):
         super().__init__(*given, **named)
         self.judged: list[Judged] = []
         self.drifted: set[tuple[int, int]] = set()
-        closer, within = self.mapper.loops, self.mapper.loops._within_drift
+        closer, within = self.mapper.loops, self.mapper.loops._drift_allows
 
         def spy(loop: LoopConstraint, *given: Any) -> bool:
             fits = within(loop, *given)
             self.drifted |= set() if fits else {loop.ends}
             return fits
 
-        closer._within_drift = spy  # type: ignore[method-assign, assignment]
+        closer._drift_allows = spy  # type: ignore[method-assign, assignment]
 
     def verify(self, a: LoopView, b: LoopView, camera: Any, config: Any) -> LoopConstraint | NoLoop:
         result = verify_loop(a, b, camera, config)

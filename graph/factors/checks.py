@@ -128,7 +128,8 @@ def check_observations(
     """A reason (0: fine) for each observation on its own."""
     z, sigmas = observations.measurements, observations.sigmas_px
     stereo = np.isfinite(z[:, 2])
-    used = np.stack([stereo | True, stereo | True, stereo], axis=1)
+    used = np.ones((len(z), 3), bool)
+    used[:, 2] = stereo
     bad_z = ~np.isfinite(z[:, :2]).all(axis=1) | np.isinf(z[:, 2])
     bad_sigma = (used & ~(np.isfinite(sigmas) & (sigmas > 0))).any(axis=1)
     depth_m, chi2 = reprojection(

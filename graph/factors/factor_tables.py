@@ -160,7 +160,7 @@ class ObservationTable:
         self._slots[rows] = slots
 
     def used_rows(self) -> Ints:
-        """Every row in use, in arbitrary order."""
+        """Every row in use, ascending."""
         used = np.ones(self._used, bool)
         used[self._free] = False
         return np.flatnonzero(used)

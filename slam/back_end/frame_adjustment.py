@@ -65,7 +65,7 @@ def frames_in(
     of a landmark and the same error of the depth sensor are in all of them. So all frames together
     count as much as the keyframes: their sigmas are larger by the root of how many more they are.
     Loops and sensors get so much more weight that beside them the images count as in the graph.
-    None if graph and frames have more observations than ``MAX_OBSERVATIONS``.
+    Both are empty if graph and frames have more observations than ``MAX_OBSERVATIONS``.
     """
     known, bf, depth_factor = tables.landmarks, camera.stereo_bf_px_m, camera.graph_depth_factor
     parts: list[Observations] = []

@@ -15,6 +15,7 @@ from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.tracking.pose_optimisation import CHI2_2DOF, CHI2_3DOF, residuals
 from bmask_slam.tracking.tracker import Tracker
+from bmask_slam.world.covisibility import MIN_SHARED
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.landmark_table import Patches
@@ -66,7 +67,7 @@ def fuse_into_neighbours(
 ) -> Ints:
     """Search a keyframe's new landmarks in its covisible neighbours; returns the ids removed."""
     _, tracked = world.observed(keyframe)
-    neighbours = [k for _, k in world.covisible(tracked, 15) if k is not keyframe]
+    neighbours = [k for _, k in world.covisible(tracked, MIN_SHARED) if k is not keyframe]
     return fuse_into(
         world, neighbours[: config.fuse_neighbours], new_ids, tracker, config.fuse_radius_px
     )

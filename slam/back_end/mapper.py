@@ -31,6 +31,7 @@ from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
+from bmask_slam.graph.factors.graph_update import LOOP
 from bmask_slam.graph.factors.own_factors import Numbered, checked_own_factors
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.sensors.streams import Measurements
@@ -43,6 +44,7 @@ from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.results import Tracked
 from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.appearance import Patches
+from bmask_slam.world.covisibility import MIN_SHARED
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_state import world_of, world_state
@@ -179,7 +181,7 @@ class Mapper:
 
     def rebuild(self) -> None:
         """Build the graph anew from the map, after segments were moved."""
-        loops = self.smoother.relative_poses("loop") + anchors(self.world, self._graph_config)
+        loops = self.smoother.relative_poses(LOOP) + anchors(self.world, self._graph_config)
         old = self.smoother.tables
         self.smoother = Smoother(self.camera, self._graph_config)
         self.smoother.tables.next_own, own = old.next_own, tuple(old.own_factors.items())
@@ -263,12 +265,11 @@ class Mapper:
         """Remove loops until all fit the graph, older ones with what they fused; their ends."""
         removed: set[Ends] = set()
         while True:
-            errors = self.smoother.relative_pose_errors("loop", self.loops.noise.bent)
-            refuted = self.loops.refuted(errors, self.world)
-            if not refuted:
+            errors = self.smoother.relative_pose_errors(LOOP, self.loops.noise.bent)
+            if not (refuted := self.loops.refuted(errors, self.world)):
                 return removed
             removed |= refuted
-            new = tuple((a, b, "loop") for a, b in sorted(refuted & fresh))
+            new = tuple((a, b, LOOP) for a, b in sorted(refuted & fresh))
             for a, b, _ in new:
                 self.events.loop_refused((a, b), "it does not fit the graph; waits for more")
             self.events.count({"loops pruned: refuted": len(new)})
@@ -289,10 +290,9 @@ class Mapper:
         tables = self.smoother.tables
         kept = self.loops.ends | {0} | tables.own_keyframes | only_witnesses(tables)
         kept |= tables.marginalised.bases
-        near = {k.id: k for _, k in self.world.covisible(landmark_ids, 15)}
+        near = {k.id: k for _, k in self.world.covisible(landmark_ids, MIN_SHARED)}
         old = [near[i] for i in sorted(near.keys() - kept, reverse=True) if i < newest.id - 2]
-        redundant = redundant_keyframe(self.world, old, self._mapping)
-        if redundant is None:
+        if (redundant := redundant_keyframe(self.world, old, self._mapping)) is None:
             return
         ids = remove_redundant(self.world, self.history, redundant)
         self._factor_selector.remove_keyframe(redundant.id)

@@ -88,7 +88,7 @@ def close_marker_loops(mapper: MapOwner) -> None:
         remove_relative_poses=tuple(sorted(names)), relative_poses=tuple(s.factor for s, _ in kept)
     )
     kept = [(s, end) for s, end in kept if not _is_covisible(mapper, end, s.factor.keyframe_b)]
-    loops = [_constraint(s, end) for s, end in kept]
+    loops = [_to_fuse(end, s.factor.keyframe_b) for s, end in kept]
     for sighting, end in kept:
         off_m = float(np.linalg.norm(sighting.error[3:]))
         mapper.events.marker_loop((end, sighting.factor.keyframe_b), sighting.marker, off_m)
@@ -185,10 +185,9 @@ def _misfits(mapper: MapOwner) -> set[RelativePoseName]:
     return found
 
 
-def _constraint(sighting: Sighting, end: int) -> LoopConstraint:
-    """A loop between two keyframes, whose landmarks are fused by projection."""
-    newer = sighting.factor.keyframe_b
-    return LoopConstraint(end, newer, np.eye(4), np.eye(6), 0, 1.0, no_pairs())
+def _to_fuse(older: int, newer: int) -> LoopConstraint:
+    """A loop of which only the ends are read: their landmarks are fused by projection."""
+    return LoopConstraint(older, newer, np.eye(4), np.eye(6), 0, 1.0, no_pairs())
 
 
 def join_by_markers(mapper: MapOwner, segment: int) -> Array | None:
@@ -199,20 +198,22 @@ def join_by_markers(mapper: MapOwner, segment: int) -> Array | None:
     """
     tables, best, chosen = mapper.smoother.tables, 0, None
     seen = {key: sightings_of(tables, key) for key in markers_in(tables)}
-    for key, own in seen.items():
-        for other, theirs in seen.items():
-            (a, number), (b, same) = marker_of(key) or (0, 0), marker_of(other) or (0, 1)
+    markers = {key: marker for key in seen if (marker := marker_of(key)) is not None}
+    for key, (own_segment, number) in markers.items():
+        for other, (other_segment, other_number) in markers.items():
+            own, theirs = seen[key], seen[other]
             count = min(len(own), len(theirs))
-            if a == segment != b and number == same and count >= MIN_SIGHTINGS and count > best:
+            joins = own_segment == segment != other_segment and number == other_number
+            if joins and count >= MIN_SIGHTINGS and count > best:
                 best, chosen = count, (key, other, own[-1].keyframe_b, theirs[-1].keyframe_b)
     if chosen is None:
         return None
     T_segment_marker, T_other_marker = (tables.keyframes.get(np.array([k]))[0] for k in chosen[:2])
     T_other_segment: Array = T_other_marker @ inverse(T_segment_marker)
-    (target, number), (older, newer) = marker_of(chosen[1]) or (0, 0), sorted(chosen[2:])
+    (target, number), (older, newer) = markers[chosen[1]], sorted(chosen[2:])
     mapper.events.joined_by_marker(segment, target, number)
     move_segment(mapper.world, segment, T_other_segment, target)
     mapper.rebuild()
-    mapper.fuse([LoopConstraint(older, newer, np.eye(4), np.eye(6), 0, 1.0, no_pairs())])
+    mapper.fuse([_to_fuse(older, newer)])
     unite_markers(mapper)
     return T_other_segment

@@ -18,7 +18,7 @@ from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.tracking.pose_optimisation import optimise_pose
 from bmask_slam.tracking.results import Tracked
 from bmask_slam.tracking.rolling_shutter import (
-    Motion,
+    CameraVelocity,
     PreviousPose,
     after_mean_row_s,
     at_one_moment,
@@ -156,7 +156,7 @@ def reinterpreted(features: Features, motion: KeyframeMotion, old: Camera, new: 
     They were moved to one moment by the readout time of the old camera, and begin at their places
     in the image again.
     """
-    known = Motion(motion.twist, 0.0)
+    known = CameraVelocity(motion.twist, 0.0)
     was = motion.twist if motion.was is None else motion.was
     depth_m = _as_exposed_m(features, was, old)
     pixels = features.image_pixels

@@ -11,6 +11,7 @@ from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.tracking.pose_optimisation import CHI2_2DOF
+from bmask_slam.world.covisibility import MIN_SHARED
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
@@ -30,7 +31,7 @@ def triangulate_landmarks(
 ) -> Ints:
     """Landmarks from keypoints without depth that match in a covisible keyframe; returns ids."""
     _, observed_ids = world.observed(keyframe)
-    neighbours = [k for _, k in world.covisible(observed_ids, 15) if k is not keyframe]
+    neighbours = [k for _, k in world.covisible(observed_ids, MIN_SHARED) if k is not keyframe]
     made = [np.zeros(0, np.int64)]
     for neighbour in neighbours[: config.neighbours]:
         rows, neighbour_rows = _free_without_depth(keyframe), _free_without_depth(neighbour)

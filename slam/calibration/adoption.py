@@ -47,17 +47,17 @@ class SelfCalibrationConfig:
             as the motion does not show the parameters.
         min_frames: fewer are not looked at, at the end of a sequence.
         stretches: how often it is looked at in vain at most; live how often at all.
-        max_sigma_s: largest standard deviation of a time that counts as observable,
-        max_sigma_share: or share of the time itself: what is that large is known well enough.
-        min_change_sigmas: what is adopted differs by so many standard deviations,
-        min_change_s: and by so much.
-        min_gain_sigmas: so many standard errors is the gain on observations kept out of the fit.
-        max_readout_s: what is surely longer is no readout within a frame's interval, but an error;
-            of one that may be, so much is adopted.
+        max_sigma_s, max_sigma_share: a time is observable if its standard deviation is below the
+            first, or below this share of the time.
+        min_change_sigmas, min_change_s: a time is adopted if it differs from the one in use by
+            both, in standard deviations and seconds.
+        min_gain_sigmas: and if observations kept out of the fit gain by so many standard errors.
+        max_readout_s: a readout time surely longer than a frame's interval is an error and refused;
+            of one that may be shorter so much is adopted.
         max_delay_s: the same of the delay of depth; drivers may stamp images as they arrive.
         max_bend_sigma, min_bend, max_bend: the same limits of the distortion of depth, in 1/m.
-        surer: what knows the distortion of depth to so small a share of the standard deviation of
-            the one adopted before takes its place.
+        surer: a new distortion of depth replaces the adopted one if its standard deviation is
+            below this share of that one's.
     """
 
     frames: int = 105

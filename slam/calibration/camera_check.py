@@ -38,11 +38,18 @@ logger = logging.getLogger(__name__)
 
 MAX_KEYFRAMES = 60
 MAX_FOCAL_CHANGE, MAX_FOCAL_BOUND = 0.015, 0.02
+"""A focal length surely further off, as a share of it, is a warning; it is not observable if its
+95 % bound is larger than the second."""
 MAX_SHIFT_SHARE = 4 / 640
-"""Of the image's width."""
+"""Depth surely further off in the image, as a share of its width, is not registered."""
 MIN_STRENGTH, MIN_STRENGTH_RATIO, MIN_SCALE_CHANGE = 6.0, 1.5, 0.05
+"""Edges of depth and colour fit if their peak is so many sigmas above its surroundings; at another
+scale if that peak is so much stronger and the scale so much different."""
 MAX_DELAY_S, SURE_DELAY_S, MAX_DELAY_BOUND_S = 0.022, 0.015, 0.015
+"""A delay of depth above the first, and surely above the second, is a warning; it is not observable
+if its 95 % bound is larger than the third."""
 LARGE_DELAY_S = 0.035
+"""A delay by edges that is surely larger is adopted before the motion is asked."""
 GAUGE_SIGMAS = np.full(6, 1e-4)
 SCALE_NOTE = (
     "depth scale: not observable, images and depth fit a world of any size; bmask-slam calibrate "

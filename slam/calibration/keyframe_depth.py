@@ -11,14 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.calibration.views import (
-    MAX_RATE_STEP_S,
-    Depths,
-    measured_at,
-)
+from bmask_slam.calibration.views import Depths, inverse_depth_change, measured_at
 from bmask_slam.graph.arrays import Array, Floats, Image, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.sequences.images import SURFACE_STEP
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +63,8 @@ class KeyframeDepth:
         inverse, first, last = (
             1.0 / image.depth_m for image in (images.depth, images.before, images.after)
         )
-        change, step_s = last - first, images.after.stamp_s - images.before.stamp_s
-        changed = ~(np.abs(change) <= SURFACE_STEP * first)
-        known = 0 < step_s < MAX_RATE_STEP_S
-        rate = np.where(changed, np.nan, change / step_s) if known else np.full_like(change, np.nan)
+        step_s = images.after.stamp_s - images.before.stamp_s
+        rate = inverse_depth_change(first, last, step_s) / step_s
         half = np.float16
         return cls(images.pixels, inverse.astype(half), rate.astype(half), images.lag_s)
 

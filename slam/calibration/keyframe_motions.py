@@ -74,7 +74,7 @@ def motions_without_images(
 ) -> dict[float, KeyframeMotion]:
     """The motion of the other frames whose images are gone, by stamp.
 
-    None if the cameras differ in the delay of depth: what that does is not known without images.
+    Empty if the cameras differ in the delay of depth: what that does is not known without images.
     """
     if old.depth_time_offset_s != new.depth_time_offset_s:
         return {}

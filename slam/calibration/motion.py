@@ -19,7 +19,7 @@ MIN_DEPTH_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class LandmarkMotion:
+class LandmarkVelocities:
     """Observed landmarks in the frames of the keyframes that observe them.
 
     Attributes:
@@ -48,7 +48,7 @@ def twists_at(path: Trajectory, stamps_s: Array) -> Array:
     return np.where(known[:, None], motions / step_s[:, None], 0.0)
 
 
-def landmark_motion(observations: Observations, run: SavedRun) -> LandmarkMotion:
+def landmark_motion(observations: Observations, run: SavedRun) -> LandmarkVelocities:
     """The motion of the observed static landmarks by the run's trajectory."""
     keyframes, rows = np.unique(observations.keyframe_ids, return_inverse=True)
     stamps_s = run.keyframe_stamps_s[np.searchsorted(run.tables.keyframes.ids, keyframes)]
@@ -56,10 +56,10 @@ def landmark_motion(observations: Observations, run: SavedRun) -> LandmarkMotion
     T_camera_world = inverse(run.tables.keyframes.get(keyframes))[rows]
     points_world = run.tables.landmarks.get(observations.landmark_ids)
     points = transform(T_camera_world, points_world[:, None])[:, 0]
-    return LandmarkMotion(points, velocities(points, twists[rows]))
+    return LandmarkVelocities(points, velocities(points, twists[rows]))
 
 
-def as_exposed(pixels: Array, motion: LandmarkMotion, camera: Camera) -> Array:
+def as_exposed(pixels: Array, motion: LandmarkVelocities, camera: Camera) -> Array:
     """Undistorted pixels (M, 2) in the image as exposed, of pixels corrected to one moment.
 
     This undoes the rolling-shutter correction of tracking.

@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import deque
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
-from bmask_slam.calibration.motion import LandmarkMotion, as_exposed
+from bmask_slam.calibration.motion import LandmarkVelocities, as_exposed
 from bmask_slam.features.keypoint_depth import mean_on_plane, smooth_value
-from bmask_slam.graph.arrays import Array, Ints, Mask
+from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
 from bmask_slam.graph.calibration.model import CalibrationViews
 from bmask_slam.graph.camera import NO_DEPTH_DISTORTION, Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations
+from bmask_slam.graph.factors.observability import component_labels
 from bmask_slam.graph.threads import in_threads
 from bmask_slam.graph.trajectory import nearest_indices
 from bmask_slam.sequences.images import SURFACE_STEP
 from bmask_slam.sequences.sequence import Sequence
 
+Real = TypeVar("Real", Floats, Array)
 MIN_VIEWS = 2
 MIN_KEYFRAME_VIEWS = 12
 MAX_RATE_STEP_S = 0.2
-MAX_LATE_S = 1e-5
+SAME_STAMP_S = 1e-5
 
 
 def connected_views(tables: FactorTables, keyframe_ids: Ints, most: int) -> Observations:
@@ -56,30 +57,15 @@ def group_sizes(ids: Ints) -> Ints:
     return np.asarray(count[rows])
 
 
-def _largest_part(observations: Observations) -> list[int]:
+def _largest_part(observations: Observations) -> Ints:
     """Ids of the keyframes in the largest part that shared landmarks connect."""
-    keyframe_ids, landmark_ids = observations.keyframe_ids, observations.landmark_ids
-    pairs = list(zip(keyframe_ids.tolist(), landmark_ids.tolist(), strict=True))
-    landmarks_of: dict[int, list[int]] = {}
-    keyframes_of: dict[int, list[int]] = {}
-    for k, landmark in pairs:
-        landmarks_of.setdefault(k, []).append(landmark)
-        keyframes_of.setdefault(landmark, []).append(k)
-    left, parts = set(landmarks_of), []
-    while left:
-        part, waiting = set(), deque([min(left)])
-        while waiting:
-            k = waiting.popleft()
-            if k not in part:
-                part.add(k)
-                waiting.extend({n for i in landmarks_of[k] for n in keyframes_of[i]} - part)
-        parts.append(sorted(part))
-        left -= part
-    return max(parts, key=len, default=[])
+    ids = np.unique(observations.keyframe_ids)
+    labels = component_labels(ids, observations, ())
+    return ids[labels == np.bincount(labels, minlength=1).argmax()]
 
 
 def make_views(
-    observations: Observations, reader: SequenceDepths, motion: LandmarkMotion
+    observations: Observations, reader: SequenceDepths, motion: LandmarkVelocities
 ) -> tuple[CalibrationViews, Ints, Ints]:
     """The views of a run, and the ids (K,) and (L,) of keyframes and landmarks.
 
@@ -204,7 +190,7 @@ def frames_of(stamps_s: dict[int, float], sequence: Sequence) -> dict[int, int]:
     """The frames of a sequence with these stamps, by the same keys; others are left out."""
     known = {k: s for k, s in stamps_s.items() if np.isfinite(s)}
     at = nearest_indices(sequence.timestamps_s, np.array(list(known.values())))
-    near = np.abs(sequence.timestamps_s[at] - np.array(list(known.values()))) < MAX_LATE_S
+    near = np.abs(sequence.timestamps_s[at] - np.array(list(known.values()))) < SAME_STAMP_S
     pairs = zip(known, at.tolist(), near, strict=True)
     return {k: index for k, index, ok in pairs if ok}
 
@@ -258,8 +244,16 @@ def _change_around(sequence: Sequence, index: int) -> tuple[Array, float]:
     depth_stamps_s = sequence.pairs.timestamps_s + sequence.pairs.lags_s
     step_s = float(depth_stamps_s[after] - depth_stamps_s[before])
     first, last = (_raw_inverse_depth(sequence, i) for i in (before, after))
+    return inverse_depth_change(first, last, step_s if after - before >= 2 else 0.0), step_s
+
+
+def inverse_depth_change(first: Real, last: Real, step_s: float) -> Real:
+    """How much inverse depth (H, W) changes from one image to another, ``step_s`` later.
+
+    NaN where the surface changed, and everywhere if no time passed, or too much.
+    """
     change = last - first
-    change[np.abs(change) > SURFACE_STEP * first] = np.nan
-    if after - before < 2 or not 0 < step_s < MAX_RATE_STEP_S:
+    change[~(np.abs(change) <= SURFACE_STEP * first)] = np.nan
+    if not 0 < step_s < MAX_RATE_STEP_S:
         change[:] = np.nan
-    return change, step_s
+    return change

@@ -99,7 +99,7 @@ class DeltaMaker:
         self._sent = _Sent()
         self._features: set[int] = set()
 
-    def has_features(self, keyframe_id: int) -> None:
+    def mark_features_known(self, keyframe_id: int) -> None:
         """Do not send the features of this keyframe: the copy has made it itself."""
         self._features.add(keyframe_id)
 

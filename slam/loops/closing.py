@@ -17,7 +17,7 @@ from bmask_slam.graph.arrays import Array, Arrays, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import chi2_quantile, mahalanobis
 from bmask_slam.graph.factors.graph_estimate import RelativePoseErrors
-from bmask_slam.graph.factors.graph_update import RelativePose
+from bmask_slam.graph.factors.graph_update import LOOP, RelativePose
 from bmask_slam.graph.files.array_file import nested, part, split_rows
 from bmask_slam.graph.pose_graph.loop_consistency import largest_clique
 from bmask_slam.loops.drift import MapDrift, implied_drift
@@ -166,8 +166,8 @@ class LoopCloser:
         for candidate in candidates:
             others = [k for k in covisible(candidate.keyframe_id) if k not in tried]
             for other in (candidate.keyframe_id, *others[: self.config.neighbours]):
-                here = world.keyframes[other].segment == keyframe.segment
-                if other in tried or here is (paths is None):
+                same_segment = world.keyframes[other].segment == keyframe.segment
+                if other in tried or same_segment != (paths is not None):
                     break
                 tried.add(other)
                 ends = (other, keyframe.id)
@@ -179,7 +179,7 @@ class LoopCloser:
                 if isinstance(result, NoLoop):
                     self._events.loop_refused(ends, result)
                     break
-                if paths and not self._within_drift(result, world, paths):
+                if paths and not self._drift_allows(result, world, paths):
                     self.recogniser.dismiss(*ends)
                     break
                 found.append(result)
@@ -193,7 +193,7 @@ class LoopCloser:
         All members are returned: loops that waited, and those that confirm them.
         """
         paths = paths or CovisiblePaths(world)
-        loops = [loop for loop in proposed if self._within_drift(loop, world, paths)]
+        loops = [loop for loop in proposed if self._drift_allows(loop, world, paths)]
         if not loops:
             return []
         found, loops = loops, [*self.waiting, *loops][-self.config.waiting :]
@@ -231,7 +231,7 @@ class LoopCloser:
         """The relative poses that a confirmed set adds to the graph."""
         robust = None if self.is_strong(loops) else self.config.robust
         return tuple(
-            RelativePose(*k.ends, k.T_a_b, self.noise.covariance(k), robust, "loop") for k in loops
+            RelativePose(*k.ends, k.T_a_b, self.noise.covariance(k), robust, LOOP) for k in loops
         )
 
     def refuted(self, errors: RelativePoseErrors, world: WorldMap) -> set[tuple[int, int]]:
@@ -256,8 +256,8 @@ class LoopCloser:
             and not inside.get(pair, False)
         }
 
-    def _within_drift(self, loop: LoopConstraint, world: WorldMap, paths: CovisiblePaths) -> bool:
-        """Whether the drift that a loop implies is possible on the shortest way between its ends.
+    def _drift_allows(self, loop: LoopConstraint, world: WorldMap, paths: CovisiblePaths) -> bool:
+        """Whether the shortest way between a loop's ends allows its drift; refused if it does not.
 
         Rooms that look alike give loops that agree with each other; only the way between them, over
         which the map cannot have drifted so far, tells them apart. Most imply so little drift that

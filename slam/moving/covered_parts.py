@@ -31,12 +31,16 @@ LEAST_CONTRAST = 4.0
 STILL, MOVED = 0.25, 0.5
 """Mean change of a cell, below and above."""
 MOST_MOVES, LEAST_CELLS = 0.4, 30
+"""A pair counts if so large a share of the cells with contrast moved, and so many of them."""
 SEEN_SHARE, SEEN_PAIRS = 0.3, 6
 """A cell is judged if it had contrast in so large a share of the pairs, and in so many."""
 ALWAYS, OFTEN = 0.75, 0.4
+"""A covered part holds a cell that stood still in the first share of its pairs; all its cells did
+in the second."""
 RESTLESS, MAX_RESTLESS = 0.3, 0.02
 """Of the other cells so small a share may stand still in more than so many of the pairs."""
 MAX_COVERED = 0.7
+"""Of the image; more is no part of it."""
 WHAT = "the robot itself, an overlay or dirt on the lens"
 
 Rectangles = tuple[tuple[int, int, int, int], ...]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
-from bmask_slam.moving.free_space_check import PointMotions
+from bmask_slam.moving.free_space_check import PointMotion, PointMotions
 
 _FAR_M = np.float32(1e6)
 
@@ -69,7 +69,11 @@ class DepthSegments:
         labels = self.labels.ravel()
         free, surface, size = (
             np.bincount(labels, weights=chosen.ravel(), minlength=count)
-            for chosen in (point_motions < 0, point_motions > 0, np.ones(point_motions.shape))
+            for chosen in (
+                point_motions == PointMotion.MOVING,
+                point_motions == PointMotion.STATIC,
+                np.ones(point_motions.shape),
+            )
         )
         moves = (free >= self.config.least) & (free >= self.config.share * (free + surface))
         moves &= size <= self.config.largest * len(labels)
@@ -83,7 +87,7 @@ class DepthSegments:
         Carried and moving samples are split into connected pieces; in each the load must not be too
         large for what carries it, nor both together too large for one thing.
         """
-        free_to_go = ~moving & (point_motions == 0) & (self.labels > 0)
+        free_to_go = ~moving & (point_motions == PointMotion.UNKNOWN) & (self.labels > 0)
         pieces = _joined_up(self.depth_m, moving | free_to_go, self.config.held_jump)
         count = int(pieces.max()) + 1
         holder, load = (np.bincount(pieces[k], minlength=count) for k in (moving, free_to_go))

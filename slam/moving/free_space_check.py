@@ -164,8 +164,9 @@ class FreeSpaceCheck:
             depth_m: (N,) NaN where missing; such keypoints keep their motion.
             point_motions: (N,).
         """
-        open_, known = np.flatnonzero(point_motions == 0), np.flatnonzero(point_motions)
-        if not len(open_) or not (point_motions[known] < 0).any():
+        is_known = point_motions != PointMotion.UNKNOWN
+        open_, known = np.flatnonzero(~is_known), np.flatnonzero(is_known)
+        if not len(open_) or not (point_motions[known] == PointMotion.MOVING).any():
             return point_motions
         tree, count = cKDTree(pixels[known]), min(self.config.neighbours, len(known))
         distance, near = tree.query(

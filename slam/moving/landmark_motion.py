@@ -90,7 +90,7 @@ class LandmarkMotion:
     def follow_map(self) -> None:
         """Move the filters of fused landmarks to their successors; drop those of removed ones."""
         landmarks = self._map.world.landmarks
-        removed = self.movability.known(landmarks.in_map)
+        removed = self.movability.known(without=landmarks.in_map)
         current = landmarks.current(removed)
         kept = landmarks.in_map[current]
         self.movability.move(removed[kept], current[kept])

@@ -13,7 +13,7 @@ from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.guided_landmarks import GuidedLandmarks
 from bmask_slam.tracking.motion_model import MotionModel
 from bmask_slam.tracking.relocalisation import RelocalisationConfig, is_within_reach, relocalise
-from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, more, reckoned, untracked
+from bmask_slam.tracking.results import Tracked, TrackingStatus, best, lost, reckoned, starting
 from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
@@ -149,13 +149,13 @@ class CameraTracker:
         """
         can_begin = self.can_begin(features)
         if self.reference is None:
-            return untracked(np.eye(4), features) if can_begin else lost(np.eye(4), features)
+            return starting(np.eye(4), features) if can_begin else lost(np.eye(4), features)
         tracked = self.track_in_map(features, everywhere=True)
         waits = self.lost_frames <= self._relocalisation.patience_frames or not can_begin
         if waits or tracked.status is not TrackingStatus.LOST:
             return tracked
         self.begin_apart()
-        return untracked(np.eye(4), features)
+        return starting(np.eye(4), features)
 
     def begin_apart(self) -> None:
         """Let the next keyframe begin a segment of its own."""
@@ -175,7 +175,7 @@ class CameraTracker:
             raise ValueError("no map has been begun")
         world = self._map.world
         self.local_ids = world.landmarks.remaining(self.local_ids)
-        tracked = self._tracked_in_image(features)
+        tracked = self._tracked_or_ahead(features)
         if tracked.status is TrackingStatus.LOST:
             tracked = self._found_again(features, everywhere) or tracked
         if tracked.status is TrackingStatus.LOST:
@@ -225,7 +225,7 @@ class CameraTracker:
         ``landmark_ids`` (N,) are those that its features observe, -1 for none. To be called before
         ``update_motion``.
         """
-        poses = (self._unseen(), T_world_camera)
+        poses = (self._without_image(), T_world_camera)
         self._images.remember(features, landmark_ids, poses, self._map.world.landmarks)
 
     def follow_map(self, T_old: Array, T_new: Array) -> None:
@@ -252,33 +252,33 @@ class CameraTracker:
 
     def _follow(self, features: Features) -> None:
         """Follow the last frame's corners into this one."""
-        T_last_next = inverse(self.motion.T_world_last) @ self._unseen()
+        T_last_next = inverse(self.motion.T_world_last) @ self._without_image()
         self._images.follow(features, T_last_next, self.motion.ago_s)
 
-    def _tracked_in_image(self, features: Features) -> Tracked:
-        """The pose by the local map; where that ends, by the landmarks ahead of the map as well."""
+    def _tracked_or_ahead(self, features: Features) -> Tracked:
+        """The pose by the local map; where that ends, by the landmarks ahead of it as well."""
         known, enough = self.local_ids, self.tracker.config.min_inliers
         tracked = self._by_landmarks(features, known)
-        if tracked.firm >= enough or not len(ahead := self._map.landmarks_ahead):
+        if tracked.by_appearance >= enough or not len(ahead := self._map.landmarks_ahead):
             return tracked
         seen, *_ = self.tracker.in_view(self._predicted(), known, self._map.world.landmarks)
         if len(seen) >= len(features):  # it does not end: something is before it, and may move
             return tracked
-        return more(tracked, self._by_landmarks(features, np.concatenate([known, ahead])), enough)
+        return best(tracked, self._by_landmarks(features, np.concatenate([known, ahead])), enough)
 
     def _by_landmarks(self, features: Features, ids: Ints) -> Tracked:
         """The pose by landmarks (N,), with the help of the image's motion where there is need."""
         enough = self.tracker.config.min_inliers
         if self._images.followed is not None:
             guided = self._guided(features, ids)
-            if guided.firm >= enough:
+            if guided.by_appearance >= enough:
                 return guided
-            return more(guided, self._tracked(features, ids), enough)
+            return best(guided, self._tracked(features, ids), enough)
         tracked = self._tracked(features, ids)
-        if tracked.firm < self._images.config.few_inliers:
+        if tracked.by_appearance < self._images.config.few_inliers:
             self._follow(features)
         followed = self._images.followed is not None
-        return more(tracked, self._guided(features, ids), enough) if followed else tracked
+        return best(tracked, self._guided(features, ids), enough) if followed else tracked
 
     def _guided(self, features: Features, ids: Ints) -> Tracked:
         """The pose by landmarks (N,), some of which were followed from the last image."""
@@ -290,10 +290,10 @@ class CameraTracker:
         """T_world_camera (4, 4), by the image's motion if that is known, else by velocity."""
         followed = self._images.followed
         if followed is None:
-            return self._unseen()
+            return self._without_image()
         return orthonormalised(self.motion.T_world_last @ followed.estimate.T_world_camera)
 
-    def _unseen(self) -> Array:
+    def _without_image(self) -> Array:
         """T_world_camera (4, 4) by the last motion; in a blackout by odometry if that knows it."""
         moved = self.motion.by_odometry(self._map.sensors) if self.lost_frames else None
         return self.motion.by_velocity() if moved is None else moved[0]

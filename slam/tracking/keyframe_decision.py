@@ -100,8 +100,11 @@ class KeyframeDecision:
         self._map = map_reader
         self._camera_tracker = camera_tracker
 
-    def reason(self, tracked: Tracked) -> str:
-        """Why a tracked frame should become a keyframe, or "" if it should not."""
+    def decide(self, tracked: Tracked) -> str:
+        """Why a tracked frame becomes a keyframe, "" if it does not.
+
+        Counts the frame; one that an earlier keyframe shows as well refers to that from now on.
+        """
         reference = self._camera_tracker.reference
         if not tracked.status.by_image:
             return "dead reckoning" if self._camera_tracker.goes_on(tracked) else ""
@@ -111,8 +114,12 @@ class KeyframeDecision:
         if not self._map.accepts_keyframes:
             return ""
         reason = keyframe_reason(self._evidence(tracked, reference), self.config)
-        known = bool(reason) and self._known_view(tracked.landmark_ids, reference, reason)
+        known = bool(reason) and self._is_known_view(tracked.landmark_ids, reference, reason)
         return "" if known else reason
+
+    def made(self) -> None:
+        """A keyframe was made; frames are counted anew."""
+        self.frames_since = 0
 
     def _evidence(self, tracked: Tracked, reference: Keyframe) -> KeyframeEvidence:
         _, points = self._map.world.observed(reference)
@@ -127,8 +134,8 @@ class KeyframeDecision:
             close_new=int(close.sum()) - close_tracked,
         )
 
-    def _known_view(self, landmark_ids: Ints, reference: Keyframe, reason: str) -> bool:
-        """Whether another keyframe shows most of these landmarks; it is the reference then.
+    def _is_known_view(self, landmark_ids: Ints, reference: Keyframe, reason: str) -> bool:
+        """Whether another keyframe shows most of these landmarks; that becomes the reference.
 
         If close points run out: whether an old one, or the reference itself if it is old, does.
         """

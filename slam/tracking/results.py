@@ -60,8 +60,8 @@ class Tracked:
     new_ids: Ints = field(default_factory=no_ids)
 
     @property
-    def firm(self) -> int:
-        """How many landmarks do not rest on the flow alone; by them a frame is WEAK."""
+    def by_appearance(self) -> int:
+        """How many landmarks were found by descriptor or patch, not by flow alone."""
         return len(self.landmark_ids) - len(self.flow_only)
 
     @property
@@ -74,17 +74,17 @@ class Tracked:
 
 def lost(T_world_camera: Array, features: Features, matches: int = 0) -> Tracked:
     """A frame that has no pose; T_world_camera (4, 4) is where it was expected."""
-    begun = untracked(T_world_camera, features)
-    return replace(begun, status=TrackingStatus.LOST, matches=matches)
+    blank = starting(T_world_camera, features)
+    return replace(blank, status=TrackingStatus.LOST, matches=matches)
 
 
-def more(first: Tracked, second: Tracked, enough: int) -> Tracked:
-    """That of two results with enough firm landmarks, then with more of all; else the first."""
-    found = [(r.firm >= enough, len(r.landmark_ids)) for r in (first, second)]
+def best(first: Tracked, second: Tracked, enough: int) -> Tracked:
+    """The result with ``enough`` landmarks by appearance, then with more of all; else the first."""
+    found = [(r.by_appearance >= enough, len(r.landmark_ids)) for r in (first, second)]
     return second if found[1] > found[0] else first
 
 
-def untracked(T_world_camera: Array, features: Features) -> Tracked:
+def starting(T_world_camera: Array, features: Features) -> Tracked:
     """A frame that begins a map at a given pose (4, 4)."""
     none = np.zeros(0, np.int64)
     information = np.zeros((6, 6))
@@ -93,10 +93,10 @@ def untracked(T_world_camera: Array, features: Features) -> Tracked:
 
 def reckoned(tracked: Tracked, T_world_camera: Array, motion: Motion) -> Tracked:
     """A frame that was lost, at the pose (4, 4) where a motion by odometry has led."""
-    begun = untracked(T_world_camera, tracked.features)
+    blank = starting(T_world_camera, tracked.features)
     status = TrackingStatus.DEAD_RECKONING
     information: Array = np.asarray(np.linalg.inv(motion.covariance), float)
-    return replace(begun, status=status, matches=tracked.matches, information=information)
+    return replace(blank, status=status, matches=tracked.matches, information=information)
 
 
 @dataclass(frozen=True)

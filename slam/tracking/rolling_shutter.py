@@ -36,8 +36,8 @@ class PreviousPose:
 
 
 @dataclass(frozen=True)
-class Motion:
-    """The camera's velocity in its own frame: twist (6,) [rad/s, m/s], standard deviation."""
+class CameraVelocity:
+    """The camera's velocity in its own frame: twist (6,) in rad/s and m/s, and its sigma."""
 
     twist: Array
     sigma: float
@@ -45,11 +45,11 @@ class Motion:
 
 def motion_since(
     previous: PreviousPose | None, T_world_camera: Array, camera: Camera
-) -> Motion | None:
+) -> CameraVelocity | None:
     """The mean motion from a pose to another; None if unknown, or with a global shutter."""
     if previous is None or camera.rolling_shutter_s == 0:
         return None
-    return Motion(previous.twist_to(T_world_camera), ACCELERATION * previous.ago_s)
+    return CameraVelocity(previous.twist_to(T_world_camera), ACCELERATION * previous.ago_s)
 
 
 def velocities(points_camera: Array, twist: Array) -> Array:
@@ -62,7 +62,7 @@ def velocities(points_camera: Array, twist: Array) -> Array:
     return -turning - twist[..., 3:]
 
 
-def at_one_moment(features: Features, camera: Camera, motion: Motion | None) -> Features:
+def at_one_moment(features: Features, camera: Camera, motion: CameraVelocity | None) -> Features:
     """The features as seen by a camera that exposes all rows at once.
 
     Keypoints without depth are corrected with the median depth.
@@ -84,8 +84,12 @@ def at_one_moment(features: Features, camera: Camera, motion: Motion | None) -> 
 
 
 def corrected(
-    motion: Motion, estimate: PoseEstimate, points_world: Array, seen: Features, camera: Camera
-) -> Motion:
+    motion: CameraVelocity,
+    estimate: PoseEstimate,
+    points_world: Array,
+    seen: Features,
+    camera: Camera,
+) -> CameraVelocity:
     """The motion estimated from landmarks, with the previous estimate as a prior.
 
     ``seen`` are N inliers of an estimate, at one moment by that motion, of landmarks (N, 3). A

@@ -27,7 +27,7 @@ from bmask_slam.tracking.pose_optimisation import (
 )
 from bmask_slam.tracking.results import Tracked, TrackingStatus, lost
 from bmask_slam.tracking.rolling_shutter import (
-    Motion,
+    CameraVelocity,
     PreviousPose,
     at_one_moment,
     corrected,
@@ -167,7 +167,7 @@ class Tracker:
         ids: Ints,
         T_world_camera: Array,
         landmarks: LandmarkTable,
-        motion: Motion | None,
+        motion: CameraVelocity | None,
     ) -> tuple[Features, PoseEstimate]:
         """The pose, and the features at one moment, by the motion estimated from them."""
         still = at_one_moment(features, self.camera, motion)

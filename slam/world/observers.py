@@ -20,15 +20,15 @@ class Observers:
         self._first = np.zeros(0, np.int32)  # entry of each landmark id
         self._keyframe = np.zeros(0, np.int32)
         self._next = np.zeros(0, np.int32)
-        self._free = np.zeros(0, np.int32)  # a stack, of which ...
-        self._unused = 0  # ... so many are there
+        self._free = np.zeros(0, np.int32)  # a stack of free entries ...
+        self._free_count = 0  # ... and how many of its elements are valid
 
     def add(self, keyframe_id: int, landmark_ids: Ints) -> None:
         """A keyframe observes landmarks (N,); one that is given twice it observes twice."""
         ids = np.sort(landmark_ids)
         self._make_room(len(ids), int(ids[-1]) + 1 if len(ids) else 0)
-        self._unused -= len(ids)
-        entries = self._free[self._unused : self._unused + len(ids)].copy()
+        self._free_count -= len(ids)
+        entries = self._free[self._free_count : self._free_count + len(ids)].copy()
         self._keyframe[entries] = keyframe_id
         self._next[entries] = self._first[ids]
         same = np.flatnonzero(ids[1:] == ids[:-1])
@@ -68,8 +68,8 @@ class Observers:
             heads = before[found] == _NONE
             self._first[ids[found][heads]] = after[heads]
             self._next[before[found][~heads]] = after[~heads]
-            self._free[self._unused : self._unused + len(gone)] = gone
-            self._unused += len(gone)
+            self._free[self._free_count : self._free_count + len(gone)] = gone
+            self._free_count += len(gone)
             ids, before = ids[~found], entries[~found]
             entries = self._next[before]
 
@@ -77,12 +77,12 @@ class Observers:
         if landmarks > (known := len(self._first)):
             more = max(landmarks - known, known, 1024)
             self._first = np.append(self._first, np.full(more, _NONE, np.int32))
-        if entries > self._unused:
+        if entries > self._free_count:
             capacity = len(self._keyframe)
             more = max(entries, capacity // 2, 4096)
             self._keyframe = np.append(self._keyframe, np.zeros(more, np.int32))
             self._next = np.append(self._next, np.full(more, _NONE, np.int32))
             unused = np.arange(capacity, capacity + more, dtype=np.int32)
-            self._free = np.append(self._free[: self._unused], unused)
+            self._free = np.append(self._free[: self._free_count], unused)
             self._free = np.append(self._free, np.zeros(capacity, np.int32))
-            self._unused += more
+            self._free_count += more

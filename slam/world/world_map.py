@@ -17,7 +17,7 @@ from bmask_slam.world.keyframe import CulledKeyframe, Keyframe
 from bmask_slam.world.landmark_table import LandmarkTable, ends_of_chains
 from bmask_slam.world.observers import Observers
 
-MAX_CULLED, MAPPED = 500, 0.05
+MAX_CULLED, MIN_SEGMENT_SHARE = 500, 0.05
 _COLUMNS = [f.name for f in fields(Features) if f.name != "gray"]
 
 
@@ -104,9 +104,9 @@ class WorldMap:
         return max(counts, key=lambda s: (s in mapped, counts[s], -s), default=0)
 
     def mapped_segments(self) -> set[int]:
-        """Those with landmarks; fewer than ``MAPPED`` of the most that one has are left-overs."""
+        """Those with landmarks; one with less than this share of the richest one's is a remnant."""
         found = self._segments(np.flatnonzero(self.landmarks.in_map))
-        return {s for s, count in found.items() if count >= MAPPED * max(found.values())}
+        return {s for s, count in found.items() if count >= MIN_SEGMENT_SHARE * max(found.values())}
 
     def segment_of(self, landmark_ids: Ints) -> int:
         """The segment whose keyframes made most of these landmarks."""

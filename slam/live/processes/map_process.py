@@ -213,7 +213,7 @@ class MapServer:
         """Add a keyframe that tracking made; changes are sent before and after optimisation."""
         started_s = time.perf_counter()
         if number > self._resent:  # else tracking may have been told to remove it
-            self._deltas.has_features(message.id)
+            self._deltas.mark_features_known(message.id)
         system = self.system
         if not self._has_reference(message):
             nowhere = message.id, NO_KEYFRAME, np.eye(4)

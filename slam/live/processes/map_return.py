@@ -70,7 +70,7 @@ class MapReturn:
             ask(self.path)
         return self._ready
 
-    def has_state(self, number: int) -> None:
+    def state_saved(self, number: int) -> None:
         """The state is written, and contains the messages up to a number."""
         self.saved = number
         self._has_state.set()

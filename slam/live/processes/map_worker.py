@@ -277,7 +277,7 @@ class MapWorker:
         """Forget the messages that a state contains, unless a workstation has to have them."""
         going = self._return
         if going is not None and message.path == going.path:
-            going.has_state(message.number)
+            going.state_saved(message.number)
             return
         self.state, self._crashes_in_a_row = message.path, 0
         self.saved = message.number

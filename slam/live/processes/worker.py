@@ -240,14 +240,18 @@ def safe_import_path() -> dict[str, str]:
     return {"PYTHONPATH": os.pathsep.join(folders), "PYTHONSAFEPATH": "1"}
 
 
-def serve(connection: int, child_socket: int, parent_end: int) -> None:
-    """Main function of the child, given descriptors; the first message says what to run."""
+def serve(connection: int, owner_ring: int, worker_ring: int) -> None:
+    """Main function of the child; the first message says what to run.
+
+    The descriptors are those of the socket, and of the shared memory in which the owner and this
+    process write.
+    """
     for number in SIGNALS:  # the process that started it decides
         if number is not signal.SIGTERM:
             signal.signal(number, signal.SIG_IGN)
-    channel = Channel(Connection(connection), (Ring(parent_end), Ring(child_socket)))
-    os.close(child_socket)
-    os.close(parent_end)
+    channel = Channel(Connection(connection), (Ring(worker_ring), Ring(owner_ring)))
+    os.close(owner_ring)
+    os.close(worker_ring)
 
     def run(first: tuple[str, tuple[Any, ...]]) -> None:
         module, _, function = first[0].partition(":")

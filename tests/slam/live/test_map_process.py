@@ -31,7 +31,7 @@ from bmask_slam.live.processes.map_process import MapServer
 from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.tracking.results import untracked
+from bmask_slam.tracking.results import starting
 from bmask_slam.world.frame_history import ENTRY, NO_KEYFRAME, UNKNOWN
 
 NO_IDS = np.zeros(0, np.int64)
@@ -45,7 +45,7 @@ def keyframe(
 ) -> NewKeyframe:
     T_world_camera = se3_exp(np.array([0, 0, 0, 0.02 * number, 0, 0]))
     frame = render_plane(T_world_camera, number)
-    tracked = untracked(T_world_camera, system.prepare(frame))
+    tracked = starting(T_world_camera, system.prepare(frame))
     first, size = 2000 * number, len(tracked.features)
     has_depth = np.isfinite(tracked.features.depth_m)
     new_ids = np.where(has_depth, first + np.cumsum(has_depth) - 1, -1)

@@ -18,7 +18,7 @@ from bmask_slam.graph.factors.graph_estimate import RelativePoseErrors
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, se3_log, so3_exp, transform
 from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
 from bmask_slam.loops.verification import LoopConstraint
-from bmask_slam.tracking.results import untracked
+from bmask_slam.tracking.results import starting
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
@@ -315,9 +315,9 @@ def test_joining_a_segment_keeps_the_closed_loops_in_the_graph() -> None:
     keypoints, ids = mapper.world.observed(newest)
     features = newest.features
     observed = replace(
-        untracked(newest.T_world_camera, features), keypoints=keypoints, landmark_ids=ids
+        starting(newest.T_world_camera, features), keypoints=keypoints, landmark_ids=ids
     )
-    mapper.join(1, untracked(wrong_pose, features), observed)
+    mapper.join(1, starting(wrong_pose, features), observed)
     assert other.segment == 0
     after = mapper.smoother.relative_pose_errors("loop")
     assert len(before.chi2) >= 3

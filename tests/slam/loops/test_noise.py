@@ -121,7 +121,7 @@ def test_right_loops_are_not_refused_for_errors_that_their_inliers_share() -> No
     world = turning_world(0.01)
     closer = LoopCloser(CAMERA, LoopClosingConfig(), EventLog())
     right = noisy_loops(world, NoiseConfig().prior_ratio)
-    assert all(closer._within_drift(loop, world, CovisiblePaths(world)) for loop in right)
+    assert all(closer._drift_allows(loop, world, CovisiblePaths(world)) for loop in right)
 
 
 @pytest.mark.parametrize(("a", "b", "fits"), [(0, 60, True), (0, 3, False)])
@@ -132,9 +132,9 @@ def test_a_map_may_be_bent_by_turns_not_without(a: int, b: int, fits: bool) -> N
     T_a_b = inverse(world.keyframes[a].T_world_camera) @ world.keyframes[b].T_world_camera
     T_bent = T_a_b @ se3_exp([0.03, 0.0, 0.04, -0.01, 0.04, 0.0])
     loop = replace(noisy_loops(world, 1.0, 1)[0], keyframe_a=a, keyframe_b=b, T_a_b=T_bent)
-    assert closer._within_drift(loop, world, CovisiblePaths(world)) == fits
+    assert closer._drift_allows(loop, world, CovisiblePaths(world)) == fits
     alias = replace(loop, T_a_b=T_a_b @ se3_exp([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))
-    assert not closer._within_drift(alias, world, CovisiblePaths(world))
+    assert not closer._drift_allows(alias, world, CovisiblePaths(world))
 
 
 @pytest.mark.parametrize(("shared", "fits"), [(11, True), (90, False), (SHARED, False)])
@@ -145,7 +145,7 @@ def test_a_map_may_be_bent_at_keyframes_that_share_few_landmarks(shared: int, fi
     T_bent = inverse(poses[0]) @ poses[3] @ se3_exp([0.0, 0.035, 0.0, 0.02, 0.0, 0.02])
     world = world_of(poses, shared)
     loop = replace(noisy_loops(turning_world(0.01), 1.0, 1)[0], keyframe_b=3, T_a_b=T_bent)
-    assert closer._within_drift(loop, world, CovisiblePaths(world)) == fits
+    assert closer._drift_allows(loop, world, CovisiblePaths(world)) == fits
 
 
 def test_a_weak_link_bends_all_that_comes_after() -> None:
@@ -309,7 +309,7 @@ def test_a_room_that_looks_like_another_is_no_loop() -> None:
         assert closer.drift.places_look_alike == (k > 3)
         T_a_b = inverse(a) @ se3_exp([0, 0, 0, 0, 0, apart_m]) @ b
         found = replace(loop, keyframe_a=0, keyframe_b=26, T_a_b=T_a_b)
-        assert closer._within_drift(found, world, paths) == fits
+        assert closer._drift_allows(found, world, paths) == fits
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.sensing.sensor_fusion import SensorFusion
 from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.relocalisation import RelocalisationConfig
-from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, untracked
+from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, starting
 from bmask_slam.tracking.rolling_shutter import PreviousPose
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 from bmask_slam.world.frame_history import FrameHistory
@@ -51,7 +51,7 @@ class RecordingTracker:
     def track(self, features: Features, T_predicted: Array, *others: Any) -> Tracked:
         self.predictions.append(T_predicted)
         self.previous.append(others[-1])
-        return (lost if self.is_lost else untracked)(T_predicted, features)
+        return (lost if self.is_lost else starting)(T_predicted, features)
 
 
 @dataclass
@@ -172,7 +172,7 @@ def test_a_lost_frame_is_tracked_on_in_the_segment_where_it_is_recognised(
     other = add_keyframe(map_reader.world, STEP, here)
     other.segment = 3
     ids = map_reader.world.make_landmarks(other, np.arange(20), points)
-    found = replace(untracked(STEP, here), keypoints=np.arange(20), landmark_ids=ids)
+    found = replace(starting(STEP, here), keypoints=np.arange(20), landmark_ids=ids)
     monkeypatch.setattr(
         camera_tracker, "recognise", lambda _, where: found if other in where else None
     )

@@ -151,7 +151,7 @@ def test_a_frame_that_is_tracked_by_the_flow_alone_is_weak_and_says_how_uncertai
     guided = replace(guided, detected=0)
     tracker = Tracker(CAMERA, TrackingConfig(subpixel=SubpixelConfig(enabled=False)))
     tracked = tracker.refine(features, T_next, np.arange(len(seen)), world, guided=guided)
-    assert tracked.status is TrackingStatus.WEAK and tracked.firm == 0
+    assert tracked.status is TrackingStatus.WEAK and tracked.by_appearance == 0
     assert len(tracked.landmark_ids) > 40
     np.testing.assert_array_equal(tracked.keypoints, np.arange(len(tracked.keypoints)))
     xi = se3_log(inverse(T_next) @ tracked.T_world_camera)

@@ -125,5 +125,5 @@ def test_close_points_may_run_out_where_an_old_keyframe_shows_the_view(
     tracker: Any = SimpleNamespace(timestamp_s=now_s, reference=keyframe)
     map_reader: Any = SimpleNamespace(world=world)
     decision = KeyframeDecision(CAMERA, KeyframeConfig(), map_reader, tracker)
-    assert decision._known_view(ids[:shared], keyframe, STARVING) is is_known
-    assert not decision._known_view(ids, keyframe, "new view")
+    assert decision._is_known_view(ids[:shared], keyframe, STARVING) is is_known
+    assert not decision._is_known_view(ids, keyframe, "new view")

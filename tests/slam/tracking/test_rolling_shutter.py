@@ -15,7 +15,7 @@ from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.pose_optimisation import optimise_pose
 from bmask_slam.tracking.rolling_shutter import (
-    Motion,
+    CameraVelocity,
     PreviousPose,
     at_one_moment,
     corrected,
@@ -60,7 +60,7 @@ def test_keypoints_are_moved_to_a_common_time() -> None:
 
     def error_px(camera_readout_s: float, twist: Array) -> float:
         camera = replace(CAMERA, rolling_shutter_s=camera_readout_s)
-        still = at_one_moment(features, camera, Motion(twist, 0.1))
+        still = at_one_moment(features, camera, CameraVelocity(twist, 0.1))
         np.testing.assert_allclose(still.disparity_px * still.depth_m, CAMERA.stereo_bf_px_m)
         u_right = still.pixels[:, 0] - still.disparity_px
         return float(np.abs(np.column_stack([still.pixels, u_right]) - truth).max())
@@ -74,10 +74,10 @@ def test_keypoints_are_moved_to_a_common_time() -> None:
 def test_a_keypoint_without_depth_moves_as_at_the_median_depth() -> None:
     points = scene()
     features, _ = exposed(points, 0.025)
-    whole = at_one_moment(features, ROLLING, Motion(TWIST, 0.1))
+    whole = at_one_moment(features, ROLLING, CameraVelocity(TWIST, 0.1))
     without_depth = np.arange(len(points)) % 4 == 0
     depth_m = np.where(without_depth, np.nan, features.depth_m)
-    still = at_one_moment(replace(features, depth_m=depth_m), ROLLING, Motion(TWIST, 0.1))
+    still = at_one_moment(replace(features, depth_m=depth_m), ROLLING, CameraVelocity(TWIST, 0.1))
     assert (
         np.isnan(still.depth_m[without_depth]).all()
         and np.isnan(still.disparity_px[without_depth]).all()
@@ -107,7 +107,7 @@ def test_the_velocity_is_found_from_matches() -> None:
     """In two steps from an error of 0.2 rad/s and 0.1 m/s, with a weak prior."""
     points = scene(300)
     features, T = exposed(points, 0.025)
-    wrong = Motion(TWIST + np.array([0.2, -0.2, 0.2, 0.1, 0.1, -0.1]), 10.0)
+    wrong = CameraVelocity(TWIST + np.array([0.2, -0.2, 0.2, 0.1, 0.1, -0.1]), 10.0)
     motion = wrong
     for _ in range(2):
         still = at_one_moment(features, ROLLING, motion)
@@ -115,7 +115,7 @@ def test_the_velocity_is_found_from_matches() -> None:
         motion = corrected(motion, estimate, points, still, ROLLING)
     before, after = np.abs(wrong.twist - TWIST), np.abs(motion.twist - TWIST)
     assert (after[:3] < 0.02).all() and (after[3:] < 0.04).all(), (before, after)
-    with_prior = corrected(Motion(wrong.twist, 1e-6), estimate, points, still, ROLLING)
+    with_prior = corrected(CameraVelocity(wrong.twist, 1e-6), estimate, points, still, ROLLING)
     np.testing.assert_allclose(with_prior.twist, wrong.twist, atol=1e-6)
 
 

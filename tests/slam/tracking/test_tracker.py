@@ -19,7 +19,7 @@ from bmask_slam.features.matching import WindowIndex, hamming
 from bmask_slam.features.patch_alignment import SubpixelConfig
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
-from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, more, untracked
+from bmask_slam.tracking.results import Tracked, TrackingStatus, best, lost, starting
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 from bmask_slam.world.world_map import WorldMap
 
@@ -303,8 +303,8 @@ def test_registration_does_not_change_the_frames_features() -> None:
 def test_lost_and_untracked_hold_no_matches() -> None:
     features = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
     assert lost(np.eye(4), features).status is TrackingStatus.LOST
-    assert untracked(np.eye(4), features).status is TrackingStatus.OK
-    for tracked in (lost(T_WORLD_CAMERA, features), untracked(T_WORLD_CAMERA, features)):
+    assert starting(np.eye(4), features).status is TrackingStatus.OK
+    for tracked in (lost(T_WORLD_CAMERA, features), starting(T_WORLD_CAMERA, features)):
         assert len(tracked.keypoints) == len(tracked.landmark_ids) == len(tracked.visible_ids) == 0
         np.testing.assert_array_equal(tracked.T_world_camera, T_WORLD_CAMERA)
 
@@ -313,7 +313,7 @@ def found(firm: int, by_flow: int) -> Tracked:
     """A frame with landmarks that were matched, and with some that only the flow shows."""
     features = make_features(np.eye(4), np.ones((0, 3)), np.zeros((0, 8), np.uint64))
     ids = np.arange(firm + by_flow)
-    return replace(untracked(np.eye(4), features), landmark_ids=ids, flow_only=ids[firm:])
+    return replace(starting(np.eye(4), features), landmark_ids=ids, flow_only=ids[firm:])
 
 
 @pytest.mark.parametrize(
@@ -330,4 +330,4 @@ def test_of_two_results_the_firm_one_or_the_larger_is_taken(
     guided: tuple[int, int], plain: tuple[int, int], better: str
 ) -> None:
     results = {"guided": found(*guided), "plain": found(*plain)}
-    assert more(results["guided"], results["plain"], 30) is results[better]
+    assert best(results["guided"], results["plain"], 30) is results[better]
