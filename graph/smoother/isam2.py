@@ -64,7 +64,7 @@ class Change:
     inertial: InertialChange = field(default_factory=InertialChange)
 
 
-def with_others(
+def apply_user_and_inertial(
     change: Change, update: GraphUpdate, tables: FactorTables
 ) -> tuple[Change, list[int]]:
     """Carry out what an update does to users' and inertial factors, once its keyframes are there.

@@ -36,7 +36,7 @@ from bmask_slam.graph.marginals.landmark_marginalisation import (
 )
 from bmask_slam.graph.marginals.summaries import mark_retracted, mark_returned, with_returning
 from bmask_slam.graph.smoother.anchoring import anchor_components, release_anchors, with_first_prior
-from bmask_slam.graph.smoother.isam2 import Change, Solver, SolverError, with_others
+from bmask_slam.graph.smoother.isam2 import Change, Solver, SolverError, apply_user_and_inertial
 from bmask_slam.graph.smoother.removal import Removal, remove
 from bmask_slam.graph.smoother.repair import repair, solve_without_own
 from bmask_slam.graph.smoother.storage import (
@@ -84,7 +84,7 @@ class Smoother:
         report.refused, report.refused_factors = validated.refused, validated.refused_factors
         report.add_removal(removal)
         entered = self._enter(validated, [before, removal, marginalised], report)
-        change, report.lost_own = with_others(entered, update, tables)
+        change, report.lost_own = apply_user_and_inertial(entered, update, tables)
         report.new_own = change.own
         try:
             self._solver.update(self._tables, change)

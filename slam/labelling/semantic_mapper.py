@@ -134,9 +134,9 @@ class SemanticMapper:
         nothing = np.full(self._rays.shape[:2], np.nan, np.float32)
         waiting = self._waiting.pop(keyframe_id, AwaitingKeyframe(np.nan, nothing))
         least, least_of_objects = self.config.least_scores(self.labels.model is not None)
-        told, config = above(instances, least), self.config.votes
-        everything = assign_pixels(told, waiting.depth_m, size, config, in_boxes=True)
-        spoken = self._label_votes.vote(keyframe_id, everything, observed, surfaces_of(instances))
+        voting, config = above(instances, least), self.config.votes
+        everything = assign_pixels(voting, waiting.depth_m, size, config, in_boxes=True)
+        voted = self._label_votes.vote(keyframe_id, everything, observed, surfaces_of(instances))
         if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
             found = self._placed(above(instances, least_of_objects), waiting.depth_m, observed)
             self._add_objects((keyframe_id, waiting), found, observed)
@@ -146,7 +146,7 @@ class SemanticMapper:
             about = (ids, on, self.labels.appearance(ids))
             view = (assignment, waiting.depth_m, observed.T_world_camera)
             self._on_masks(KeyframeMasks(keyframe_id, self.names, *view, *about))
-        return Attachment(keyframe_id, len(instances), spoken)
+        return Attachment(keyframe_id, len(instances), voted)
 
     def follow_map(self) -> None:
         """Keep up with what became of landmarks and keyframes.

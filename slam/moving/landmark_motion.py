@@ -62,19 +62,21 @@ class LandmarkMotion:
         return ids[self.movability.moving(ids)]
 
     def observe_masks(
-        self, masks: KeyframeMasks, sightings: Sequence[Sighting | None], standing: Sequence[bool]
+        self,
+        masks: KeyframeMasks,
+        sightings: Sequence[Sighting | None],
+        class_is_no_evidence: Sequence[bool],
     ) -> None:
         """Set the priors of landmarks by the classes of their instances, and update them by views.
 
-        ``standing`` (K,) are instances that stood still for so long that their class is no
-        evidence.
+        An instance's class is no evidence, one of (K,), where it has stood for long.
         """
         ids, first = np.unique(masks.landmark_ids, return_index=True)
         priors = masks.label_distributions[first] @ self._priors.of(masks.names)
         instances = masks.instances[first]
-        still = np.array([*standing, False])
+        stands = np.array([*class_is_no_evidence, False])
         evidence = np.array([0.0 if s is None else s.evidence for s in sightings] + [0.0])
-        priors[still[instances]] = np.minimum(priors[still[instances]], self._priors.unknown)
+        priors[stands[instances]] = np.minimum(priors[stands[instances]], self._priors.unknown)
         self.movability.set_priors(ids, np.clip(priors, 0.01, 0.99))
         judged = evidence[instances] != 0
         self.movability.update(ids[judged], evidence[instances[judged]] > 0)

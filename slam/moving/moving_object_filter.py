@@ -90,7 +90,7 @@ class MovingObjectFilter:
         static = self.static_features_at(frame, features, predicted, views)
         doubted = static.moving.sum() > self.config.doubt_share * len(features)
         settled = max(self.config.min_static, self.config.settled_share * len(features))
-        if predicted is not None and doubted and static.standing < settled:
+        if predicted is not None and doubted and static.static_count < settled:
             found = self._camera_tracker.preview(features)
             if found is None:
                 return replace(static, features=features, mostly_moving=True)
@@ -112,9 +112,9 @@ class MovingObjectFilter:
         if np.count_nonzero(~moving) < self.config.min_static:
             logger.info("frame %d: nearly all features move; all are used", frame.index)
             return StaticFeatures(features, moving, True, view)
-        standing = int(np.count_nonzero(motions == PointMotion.STATIC))
+        static_count = int(np.count_nonzero(motions == PointMotion.STATIC))
         left = select(features, np.flatnonzero(~moving))
-        return StaticFeatures(left, moving, False, view, standing, T_world_camera, space)
+        return StaticFeatures(left, moving, False, view, static_count, T_world_camera, space)
 
     def learn(self, timestamp_s: float, tracked: Tracked, static: StaticFeatures) -> bool:
         """Update landmarks and pending instances by the depth of a tracked frame.
@@ -163,16 +163,17 @@ class MovingObjectFilter:
         visible_surfaces = surfaces(
             self.camera, masks, self.config.check.window_px, self.config.min_judged
         )
-        stood = self.static_verification.stood(masks, visible_surfaces, recent, now_s)
-        sightings = self._instance_motion.sightings(masks, visible_surfaces, stood, views, now_s)
+        stood_before = self.static_verification.stood(masks, visible_surfaces, recent, now_s)
+        about = masks, visible_surfaces, stood_before
+        sightings = self._instance_motion.sightings(*about, views, now_s)
         moving, tracks = self._tracked_instances(masks, sightings, now_s)
-        still = [
+        class_is_no_evidence = [
             s is not None and (s.still or (track is not None and track.stood))
             for s, track in zip(sightings, tracks, strict=True)
         ]
-        self.landmarks.observe_masks(masks, sightings, still)
-        standing = np.isin(masks.assignment.owner, np.flatnonzero(still))
-        self.keyframe_views.restore_depth(masks.keyframe_id, standing)
+        self.landmarks.observe_masks(masks, sightings, class_is_no_evidence)
+        static_pixels = np.isin(masks.assignment.owner, np.flatnonzero(class_is_no_evidence))
+        self.keyframe_views.restore_depth(masks.keyframe_id, static_pixels)
         if not moving.any():
             return
         moves = np.isin(masks.assignment.owner, np.flatnonzero(moving))

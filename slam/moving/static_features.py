@@ -31,7 +31,7 @@ class StaticFeatures:
         moving: (N,) which of the frame's own features lie on moving things.
         mostly_moving: too few would have been left, so that all are used.
         view: the frame's depth as free space and surfaces; None if geometry is switched off.
-        standing: number of features that lie where earlier views saw a surface.
+        static_count: number of features that lie where earlier views saw a surface.
         T_world_camera: (4, 4) that they were judged at; None if none was left out.
         space: where something moves in the frame; None if that is not known.
     """
@@ -40,7 +40,7 @@ class StaticFeatures:
     moving: Mask
     mostly_moving: bool
     view: DepthView | None
-    standing: int = 0
+    static_count: int = 0
     T_world_camera: Array | None = None
     space: MovingSpace | None = None
 
