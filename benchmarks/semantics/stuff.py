@@ -1,10 +1,12 @@
 """What the head that gives every pixel a class reaches on NYU Depth v2's official test images.
 
-    python -m benchmarks.semantics.stuff [--weights F] [--part test|held-out] [--picture F]
+    python -m benchmarks.semantics.stuff [--weights F] [--part test|held-out] [--scale S] [--turn D]
 
 Pixels without a class, and those of otherprop, do not count. Classes are the likeliest of the 39;
 groups the likeliest of the 13, whose probabilities are sums. Accuracy is the share of a class's
-pixels that are found; IoU is over all images. Cost is processor time of one thread.
+pixels that are found; IoU is over all images. Cost is processor time of one thread. With a scale
+or a turn the middle of each image is enlarged or turned, as a camera that is near, or not upright,
+would see it.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import argparse
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -20,8 +23,9 @@ from torch.nn import functional as F
 
 from benchmarks.semantics.nyuv2 import CLASSES, GROUP_OF, GROUPS, labelled, numbers
 from benchmarks.semantics.train_stuff import held_out
-from bmask_slam.graph.arrays import Array, Bytes, Ints
+from bmask_slam.graph.arrays import Array, Bytes, Image, Ints
 from bmask_slam.graph.files.data_files import data_path
+from bmask_slam.semantics.network.yolox.network import PAD_VALUE
 from bmask_slam.semantics.training.stuff_images import IGNORED
 from bmask_slam.semantics.weights import light_weights, stuff_weights
 
@@ -40,7 +44,17 @@ def figures(counts: Ints) -> tuple[Array, Array, float]:
     return right / (there + found - right), right / there, float(right.sum() / counts.sum())
 
 
-def measure(weights: Path, part: str) -> None:
+def seen_from(image: Image, labels: Bytes, scale: float, turn_deg: float) -> tuple[Image, Bytes]:
+    """An image (H, W, 3) and its classes (H, W), enlarged and turned about the middle."""
+    size = image.shape[1], image.shape[0]
+    matrix = cv2.getRotationMatrix2D((size[0] / 2, size[1] / 2), turn_deg, scale)
+    outside, nothing = (PAD_VALUE,) * 3, (IGNORED,)
+    placed = cv2.warpAffine(image, matrix, size, flags=cv2.INTER_LINEAR, borderValue=outside)
+    classes = cv2.warpAffine(labels, matrix, size, flags=cv2.INTER_NEAREST, borderValue=nothing)
+    return np.asarray(placed, np.uint8), np.asarray(classes, np.uint8)
+
+
+def measure(weights: Path, part: str, scale: float, turn_deg: float) -> None:
     """Print the figures of a part of the images."""
     torch.set_num_threads(1)
     detector = light_weights.load_light(data_path(*light_weights.SHIPPED)).model.detector
@@ -51,7 +65,8 @@ def measure(weights: Path, part: str) -> None:
     group_of = np.append(GROUP_OF, [IGNORED] * (256 - CLASSES))
     times, sure = [], np.zeros((10, 3))
     with torch.inference_mode():
-        for image, labels in labelled(chosen):
+        for whole in labelled(chosen):
+            image, labels = seen_from(*whole, scale, turn_deg)
             x, _ = detector.letterboxed(torch.from_numpy(image).permute(2, 0, 1))
             stamps = [time.process_time()]
             features = detector.features(x)
@@ -103,8 +118,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--part", choices=("test", "held-out"), default="test")
+    parser.add_argument("--scale", type=float, default=1.0)
+    parser.add_argument("--turn", type=float, default=0.0, help="degrees")
     arguments = parser.parse_args()
-    measure(arguments.weights or data_path(*stuff_weights.SHIPPED), arguments.part)
+    weights = arguments.weights or data_path(*stuff_weights.SHIPPED)
+    measure(weights, arguments.part, arguments.scale, arguments.turn)
 
 
 if __name__ == "__main__":
