@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.evaluation.recordings import JOINED
 from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera, direction_of
 from bmask_slam.graph.errors import InputError
@@ -23,6 +25,8 @@ from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_state import world_of
 from bmask_slam.world.world_map import WorldMap
 
+logger = logging.getLogger(__name__)
+
 MAX_LENGTH_ERROR = 1e-3
 
 
@@ -33,13 +37,14 @@ class SavedMap:
     Attributes:
         path: the run folder.
         world: the map.
-        keyframes: those of its largest segment, oldest first.
+        keyframes: those of its largest segment that its recording shows, oldest first.
         camera: of the images, with distortion.
         labels: the classes of its landmarks; None if the run had no segmenter.
         sides: the side of keyframes' images that is up, of `graph.camera.SIDES`, by keyframe id; ""
             where that is not known.
         up_world: (3,) unit vector of these keyframes, by an accelerometer or an IMU in the graph;
             None without.
+        foreign: number of the segment's other keyframes, of recordings that the run continued.
     """
 
     path: Path
@@ -49,6 +54,7 @@ class SavedMap:
     labels: RunLabels | None = None
     sides: dict[int, str] = field(default_factory=dict)
     up_world: Array | None = None
+    foreign: int = 0
 
     def poses(self) -> dict[int, Array]:
         """The current T_world_camera (4, 4) of every keyframe by its id."""
@@ -99,11 +105,16 @@ def open_run(path: Path, sequence: Path | None = None) -> MappedRun:
     """Open a finished run; ``sequence`` is needed if the images have moved.
 
     Raises:
-        InputError: no map in the folder, or no sequence.
+        InputError: no map in the folder, no keyframe of its recording, or no sequence.
     """
     if not path.is_dir():
         raise InputError(f"{path}: no such folder; give the folder of a finished run")
     saved = read_saved_map(path)
+    if saved.foreign:
+        of_others = f"{saved.foreign} keyframes are of recordings that it continued"
+        if not saved.keyframes:
+            raise InputError(f"{path}: all {of_others}; give the runs of these")
+        logger.warning("%s: %s, and left out; map the runs of these", path, of_others)
     folder = sequence or find_sequence(path)
     opened = open_sequence(folder, camera=saved.camera)
     return MappedRun(**vars(saved), sequence=opened)
@@ -131,7 +142,14 @@ def read_saved_map(path: Path) -> SavedMap:
         labels = saved_labels(part(state, "semantics"), path)
         up_world = _measured_up(part(state, "mapper.graph"), segment)
         sides = _sides(part(state, "semantics.upright"))
-    return SavedMap(path, world, world.in_segment(segment), camera, labels, sides, up_world)
+    keyframes = world.in_segment(segment)
+    if (path / JOINED).is_file():
+        own = [k for k in keyframes if np.isfinite(k.timestamp_s)]
+    else:
+        first = int(state.get("first_keyframe", 0))
+        own = [k for k in keyframes if k.id >= first]
+    foreign = len(keyframes) - len(own)
+    return SavedMap(path, world, own, camera, labels, sides, up_world, foreign)
 
 
 def _sides(upright: Arrays) -> dict[int, str]:

@@ -266,6 +266,21 @@ def test_keyframes_that_cannot_be_used_are_skipped(
         assert text in err
 
 
+def test_keyframes_of_a_recording_that_was_continued_are_left_out(
+    mapped: Path, tmp_path: Path, caplog
+) -> None:
+    """Their stamps may be those of other images of this recording."""
+    run = shutil.copytree(mapped, tmp_path / "run")
+    state, camera = read_map(run)
+    ids = np.sort(state["mapper.world.keyframes.id"])
+    write_map(run / "map", {**state, "first_keyframe": np.array(ids[2])}, camera)
+    assert [k.id for k in open_run(run).keyframes] == ids[2:].tolist()
+    assert "2 keyframes are of recordings that it continued, and left out" in caplog.text
+    write_map(run / "map", {**state, "first_keyframe": np.array(ids[-1] + 1)}, camera)
+    with pytest.raises(InputError, match=r"run: all .* recordings that it continued; give"):
+        open_run(run)
+
+
 def test_a_keyframe_without_depth_is_refused(room: Path, tmp_path: Path) -> None:
     sequence = open_sequence(room)
     run = make_run(tmp_path / "run", sequence)
