@@ -9,9 +9,8 @@ order of time do not prove it, the half of every second keyframe. The last look 
 
 from __future__ import annotations
 
-import dataclasses
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,7 +30,7 @@ FREE = (*TIMES, *BENDS)  # what is estimated, by places in PARAMETERS
 CALIBRATE = ("auto", "report", "off")
 """Whether what is found is used, only told, or not looked for."""
 NAMES = {SHUTTER: "rolling shutter", TIME: "colour-depth delay"}
-MAX_READOUT_S, MAX_DELAY_S = 0.035, 0.1
+LIMITS_S = {SHUTTER: 0.035, TIME: 0.1}
 UNOBSERVABLE = "readout, delay and bend of depth not observable in the motion"
 PLACES = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-0.75, 0.75, 7)), axis=-1)
 BEND_TERMS = depth_distortion_terms(PLACES).reshape(-1, len(BENDS))
@@ -68,8 +67,8 @@ class SelfCalibrationConfig:
     min_change_sigmas: float = 3.0
     min_change_s: float = 0.002
     min_gain_sigmas: float = 2.0
-    max_readout_s: float = MAX_READOUT_S
-    max_delay_s: float = MAX_DELAY_S
+    max_readout_s: float = LIMITS_S[SHUTTER]
+    max_delay_s: float = LIMITS_S[TIME]
     max_bend_sigma: float = 0.004
     min_bend: float = 0.003
     max_bend: float = 0.1
@@ -215,19 +214,18 @@ def judged(
         verdict = "found and applied" if mode == "auto" else "found, not applied"
         text = format_found(estimate, chosen, verdict)
         if mode != "auto":
-            return dataclasses.replace(state, text=text, settled=True)
+            return replace(state, text=text, settled=True)
         camera = camera_with(state.camera, estimate.found, chosen)
         sigma = _rms_sigma(estimate.sigmas[BEND]) if BENDS[0] in chosen else state.bend_sigma
-        return dataclasses.replace(state, camera=camera, text=text, settled=True, bend_sigma=sigma)
+        return replace(state, camera=camera, text=text, settled=True, bend_sigma=sigma)
     if state.adopted:
         return state
     seen = [i for i in free if estimate.shows(i, config)]
     differs = any(estimate.differs(i, config) for i in free)
     verdict = "not sure enough to be applied" if differs else "the camera keeps it"
     text = format_found(estimate, seen, verdict) if seen else UNOBSERVABLE
-    looked_for = np.count_nonzero(estimate.sigmas[list(free)])
-    settled = bool(len(seen) == looked_for and not differs)
-    return dataclasses.replace(state, text=text, looks=state.looks + 1, settled=settled)
+    settled = bool(len(seen) == np.count_nonzero(estimate.sigmas[list(free)]) and not differs)
+    return replace(state, text=text, looks=state.looks + 1, settled=settled)
 
 
 def adopted_parameters(state: SelfCalibration) -> set[int]:
@@ -269,10 +267,10 @@ def camera_with(camera: Camera, values: Array, chosen: list[int]) -> Camera:
     """The camera with some of the parameters of a vector (18,), rounded as in camera.yaml."""
     calibration = parameters_of(camera, camera.depth_scale)
     calibration[chosen] = values[chosen]
-    calibration[SHUTTER] = np.clip(calibration[SHUTTER], -MAX_READOUT_S, MAX_READOUT_S)
-    calibration[TIME] = np.clip(calibration[TIME], -MAX_DELAY_S, MAX_DELAY_S)
+    for i, most_s in LIMITS_S.items():
+        calibration[i] = np.clip(calibration[i], -most_s, most_s)
     found = camera_from(camera, calibration)
-    return dataclasses.replace(
+    return replace(
         camera,
         rolling_shutter_s=found.rolling_shutter_s,
         depth_time_offset_s=found.depth_time_offset_s,
@@ -282,8 +280,10 @@ def camera_with(camera: Camera, values: Array, chosen: list[int]) -> Camera:
 
 def format_found(estimate: Estimate, parameters: tuple[int, ...] | list[int], verdict: str) -> str:
     """Parameters in milliseconds and millimetres with 95 % bounds, and what became of them."""
+    found = estimate.found
     parts = [
-        f"{NAMES[i]} {1e3 * estimate.found[i]:.1f} ± {1.96e3 * estimate.sigmas[i]:.1f} ms"
+        f"{NAMES[i]} {1e3 * found[i]:.1f} ± {1.96e3 * estimate.sigmas[i]:.1f} ms"
+        + (f" (at most {1e3 * LIMITS_S[i]:.0f} are used)" if abs(found[i]) > LIMITS_S[i] else "")
         for i in parameters
         if i in TIMES and estimate.sigmas[i] > 0
     ]

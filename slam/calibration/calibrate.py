@@ -179,7 +179,7 @@ def make_problem(
     sigmas = options.priors.sigmas(run.camera)
     has_anchor = options.reference is not None or options.known_distance is not None
     if not has_anchor:  # a scale that nothing fixes and an offset take each other's part
-        sigmas[OFFSET] = 0.0
+        sigmas[[FACTOR, OFFSET]] = 0.0
     fixed = {parameter for name in options.fixed for parameter in parameters_named(name)}
     sigmas[np.isin(PARAMETERS, list(fixed))] = 0.0
     start = parameters_of(run.camera, run.camera.depth_scale)
@@ -217,8 +217,9 @@ def _with_distance(
     late_s = np.abs(trajectory.timestamps_s[at] - moments_s)
     if not distance_m > 0 or late_s.max() > MAX_TIME_DIFFERENCE_S or at[0] == at[1]:
         raise InputError(
-            f"--known-distance {' '.join(f'{x:g}' for x in known)}: give two different stamps of "
-            f"{run.path / 'trajectory.txt'} and a positive distance in metres"
+            f"--known-distance {' '.join(f'{x:.16g}' for x in known)}: give two different stamps "
+            f"of {run.path / 'trajectory.txt'}, to {MAX_TIME_DIFFERENCE_S:g} s, and a positive "
+            "distance in metres"
         )
     ends = nearest_indices(stamps_s, np.array(moments_s))
     T_world_keyframe = run.tables.keyframes.get(keyframe_ids[ends])

@@ -477,6 +477,9 @@ def test_no_readout_is_longer_than_a_frame() -> None:
     camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
     values = np.where(np.arange(18) == SHUTTER, 0.0365, 0.0)
     assert camera_with(camera, values, [SHUTTER]).rolling_shutter_s == 0.035
+    sure = Estimate(np.zeros(18), values, np.full(18, 0.001), None)  # type: ignore[arg-type]
+    text = "rolling shutter 36.5 ± 2.0 ms (at most 35 are used): said"
+    assert format_found(sure, (SHUTTER,), "said") == text
 
 
 @pytest.mark.parametrize(
