@@ -50,6 +50,8 @@ MAX_DELAY_S, SURE_DELAY_S, MAX_DELAY_BOUND_S = 0.022, 0.015, 0.015
 if its 95 % bound is larger than the third."""
 LARGE_DELAY_S = 0.035
 """A delay by edges that is surely larger is adopted before the motion is asked."""
+NEAREST_M, FARTHEST_M, DEPTH_FRAMES = 0.1, 50.0, 5
+"""A median depth outside these is a wrong unit; by so many images of the sequence."""
 GAUGE_SIGMAS = np.full(6, 1e-4)
 SCALE_NOTE = (
     "depth scale: not observable, images and depth fit a world of any size; bmask-slam calibrate "
@@ -103,6 +105,24 @@ def check_camera(run: SavedRun, sequence: Sequence) -> CameraCheck:
     warnings = tuple(f.text for f in findings if f.is_warning)
     rows = [r for f in findings for r in f.rows] + [row("camera_warnings", len(warnings), "1")]
     return CameraCheck(warnings, tuple(f.text for f in findings if not f.is_warning), tuple(rows))
+
+
+def depth_warning(sequence: Sequence) -> str:
+    """What is wrong with the unit of depth: a camera sees things that are near, but not too near.
+
+    "" where nothing is, or no image has depth. Raises InputError: images cannot be read.
+    """
+    frames = np.unique(np.linspace(0, len(sequence) - 1, DEPTH_FRAMES).astype(int))
+    depths_m = np.concatenate([sequence.load(k).depth_m.ravel() for k in frames.tolist()])
+    depths_m = depths_m[np.isfinite(depths_m)]
+    median_m = float(np.median(depths_m)) if len(depths_m) else np.nan
+    if not (median_m < NEAREST_M or median_m > FARTHEST_M):
+        return ""
+    scale = sequence.camera.depth_scale
+    return (
+        f"depth: {median_m:.4g} m in the median, with depth_scale {scale:g}; check depth_scale in "
+        "camera.yaml, what a depth image has for one metre: 1000, 5000 or, of metres, 1"
+    )
 
 
 def sure_registration(scores: EdgeScores) -> Registration | None:

@@ -83,8 +83,9 @@ class RunOptions:
             )
         if self.localise is None:
             return
-        for option in ("map", "checkpoint_every", "dense"):
-            if getattr(self, option):
+        given = vars(self) | {"covariances": self.config.covariances}
+        for option in ("map", "checkpoint_every", "dense", "covariances"):
+            if given[option]:
                 raise InputError(
                     f"--localise {self.localise}: does not extend the map, which {_flag(option)} "
                     "needs; give one of the two"
@@ -116,9 +117,9 @@ class RunOptions:
         for option in (name for name in given if name not in free):
             value, own = given[option], getattr(self, option)
             if own != (_absolute(value) if isinstance(value, Path) else value):
-                was = "another configuration" if option == "config" else own
                 raise InputError(
-                    f"{_flag(option)}: the run was started with {was}; omit it, or start a new run"
+                    f"{_flag(option)}: the run was started {_words(option, own)}; omit it, or "
+                    "start a new run"
                 )
         taken = (*free, "config")  # an equal one may name a class that only its user may name
         return replace(self, **{name: given[name] for name in taken if name in given})
@@ -127,6 +128,13 @@ class RunOptions:
 def _absolute(path: Path) -> Path:
     """The path from the root; the name of a camera preset as it is."""
     return path if is_preset(path) else path.absolute()
+
+
+def _words(option: str, own: object) -> str:
+    """An option's value that a run was started with, in words."""
+    if own is None or isinstance(own, bool):
+        return f"{'with' if own else 'without'} {_flag(option)}"
+    return "with another configuration" if option == "config" else f"with {own}"
 
 
 def _flag(option: str) -> str:

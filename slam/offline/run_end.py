@@ -7,13 +7,14 @@ import signal
 from dataclasses import dataclass
 from pathlib import Path
 
-from bmask_slam.calibration.camera_check import CameraCheck, check_camera
+from bmask_slam.calibration.camera_check import CameraCheck, check_camera, depth_warning
 from bmask_slam.evaluation import Row
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.whole_file import remove
 from bmask_slam.offline.frame_loop import ActiveRun, map_options, write_found_camera
 from bmask_slam.run_folder.folder import CHECKPOINT, DENSE
-from bmask_slam.run_folder.metrics import measure, save
+from bmask_slam.run_folder.metrics import measure, row, save
+from bmask_slam.run_folder.reader import STOPPED
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.system import SlamSystem
 
@@ -56,6 +57,8 @@ def finish_run(run: ActiveRun) -> RunSummary:
     rows = measure(run.system, run.reference, counters, options.stride)
     checked = _camera_checked(run)
     rows += checked.rows
+    if stopped_by is not None:
+        rows.append(row(STOPPED, counters.frames, "frames"))
     title = "-".join(filter(None, (run.sequence.name, options.config_name)))
     save(run.system, run.folder, rows, run.reference, title)
     if options.dense:
@@ -104,6 +107,9 @@ def _camera_checked(run: ActiveRun) -> CameraCheck:
     if not isinstance(run.system, SlamSystem) or run.stop.signal is not None:
         return nothing
     try:
+        if unit := depth_warning(run.sequence):
+            logger.warning("camera: %s", unit)
+            return CameraCheck((unit,), (), ())
         checked = check_camera(run.system.as_run(), run.sequence)
     except InputError as error:
         logger.info("camera not checked: %s", error)

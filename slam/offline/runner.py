@@ -37,6 +37,7 @@ from bmask_slam.run_folder.map_file import read_map
 from bmask_slam.run_folder.metrics import RunCounters
 from bmask_slam.run_folder.open_files import free_run_path
 from bmask_slam.run_folder.origin import Origin
+from bmask_slam.run_folder.reader import Run
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.semantics.segmenters.upright import Upright
@@ -103,7 +104,7 @@ def resume(
         InputError: there is no checkpoint, it is broken or of another version, or sequence,
             configuration or options differ from those of the run.
     """
-    if (path / "metrics.json").exists() and not (path / CHECKPOINT).exists():
+    if (path / "metrics.json").exists() and Run(path).is_finished:
         return None
     checkpoint = read_checkpoint(path)
     options = checkpoint.options.with_given(given or {})

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +18,7 @@ from bmask_slam.calibration.camera_check import (
     CameraCheck,
     check_camera,
     delay_warning,
+    depth_warning,
     sure_registration,
     with_sure_delay,
 )
@@ -168,3 +171,23 @@ def test_depth_edges_are_where_the_surface_in_front_ends() -> None:
 
 def _best(scores) -> tuple[int, ...]:
     return tuple(int(i) for i in np.unravel_index(scores.argmax(), scores.shape))
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "text"),
+    [
+        (9000.0, "depth: 9000 m in the median, with depth_scale 5000; check depth_scale"),
+        (0.009, "depth: 0.009 m in the median"),
+        (2.0, ""),
+        (np.nan, ""),
+    ],
+)
+def test_a_wrong_unit_of_depth_is_told(depth_m: float, text: str) -> None:
+    class Images(list[SimpleNamespace]):
+        camera = Camera(6, 4, 5.0, 5.0, 3.0, 2.0)
+        load = list.__getitem__
+
+    frames = [SimpleNamespace(depth_m=np.full((4, 6), depth_m, np.float32)) for _ in range(3)]
+    sequence: Any = Images(frames)
+    found = depth_warning(sequence)
+    assert found.startswith(text) and bool(found) == bool(text)
