@@ -31,6 +31,7 @@ SEMANTIC_FILES = (LABELS, OBJECTS, BOXES, OBJECTS_PICTURE)
 _COLUMNS = ("id", "label", "probability", "entropy", "views")
 _SURFACE_COLUMNS = ("surface", "surface_probability")
 _SHORTEST_UP = 1e-6
+_WITH_LABELS = "give a run that had a segmenter, not what `optimise` made of it"
 """Its coordinates are written with so many decimals."""
 
 
@@ -94,7 +95,7 @@ def read_labels(run: Path) -> LabelTable:
     """
     path = run / LABELS
     if not path.is_file():
-        raise InputError(f"{path}: no such file; give a run that had a segmenter")
+        raise InputError(f"{path}: no such file; {_WITH_LABELS}")
     columns = read_table(path, _COLUMNS, "run again")
 
     def numbers(name: str, parse: Callable[[str, str], float]) -> list[float]:
@@ -239,7 +240,7 @@ def read_scene(run: Path) -> SavedScene:
     if not run.is_dir():
         raise InputError(f"{run}: no such folder; give that of a run that had a segmenter")
     if not path.is_file():
-        raise InputError(f"{path}: no such file; give a run that had a segmenter")
+        raise InputError(f"{path}: no such file; {_WITH_LABELS}")
     content = read_json(path, _ObjectFile, "run again")
     floor_m = np.nan if content.floor_m is None else content.floor_m
     up_world = np.array(content.up_world)
