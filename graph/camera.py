@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Mask
-from bmask_slam.graph.errors import MAX_NUMBER
-from bmask_slam.graph.lens import columns, distort_normalised, undistort_normalised
+from bmask_slam.graph.errors import MAX_NUMBER, InputError
+from bmask_slam.graph.lens import columns, distort_normalised, five_terms, undistort_normalised
 
 NO_DEPTH_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 MAX_SIDE_PX, MAX_REDUCTION = 65_535, 4
@@ -46,10 +46,9 @@ class DepthNoise:
         """That of a disparity bf / z with a constant standard deviation: z^2 / bf sigma."""
         return cls(c_per_m=sigma_px / bf_px_m)
 
-    def times(self, factor: float) -> DepthNoise:
-        """All standard deviations multiplied by a factor."""
-        a_m, b, c_per_m = (factor * value for value in (self.a_m, self.b, self.c_per_m))
-        return replace(self, a_m=a_m, b=b, c_per_m=c_per_m)
+    def times(self, k: float) -> DepthNoise:
+        """All standard deviations multiplied by ``k``."""
+        return replace(self, a_m=k * self.a_m, b=k * self.b, c_per_m=k * self.c_per_m)
 
     def fault(self) -> str:
         """What no depth sensor has, in words after the coefficients; "" for a possible noise."""
@@ -93,12 +92,10 @@ class Camera:
     ``depth_distortion`` is what the sensor adds to the inverse depth, in 1/m: coefficients of
     ``depth_distortion_terms``. Structured light bends its depth images so, by an error of the
     disparity that varies smoothly over the image (Herrera et al., PAMI 34, 2012).
-    ``up`` is the side of the image that is up in the world, one of SIDES, where the camera is
-    mounted sideways or upside down; "": not said.
+    ``up`` is the side of the image, one of SIDES, that is up in the world; "": not said.
     ``covered`` are parts of the image that do not show the room: the robot itself, an overlay, dirt
     on the lens. Rectangles (left, top, right, bottom) in pixels, the last column and row excluded.
-    ``reduced_by``: images are recorded so many times as wide and high, and reduced when they are
-    read; all else is of the reduced ones.
+    ``reduced_by``: images are recorded so many times as wide and high; all else is of reduced ones.
     """
 
     width: int
@@ -120,19 +117,23 @@ class Camera:
     covered: tuple[tuple[int, int, int, int], ...] = ()
     reduced_by: int = 1
 
-    def fault(self) -> str:
-        """What no camera can be, in words; "" for a possible camera."""
+    def __post_init__(self) -> None:
+        """Raise InputError for what no camera can be; of four terms of distortion k3 is 0."""
+        object.__setattr__(self, "distortion", five_terms(self.distortion))
         names = {f.name for f in fields(self)} - {"depth_noise", "up", "covered"}
         flat: Array = np.concatenate([np.ravel(getattr(self, n)) for n in names]).astype(float)
         if not (np.abs(flat) <= MAX_NUMBER).all():
-            return "a number that is not finite"
+            raise InputError("a camera with a number that is not finite; correct it")
+        if not (1 <= self.width <= MAX_SIDE_PX and 1 <= self.height <= MAX_SIDE_PX):
+            raise InputError(f"an image of {self.width} x {self.height} pixels; correct its size")
+        if (low := min(self.fx, self.fy, self.depth_scale, self.fps, self.stereo_bf_px_m)) < LEAST:
+            what = f"a focal length, depth scale, rate or stereo_bf of {low:g}"
+            raise InputError(f"{what}, which is not positive, or below {LEAST:g}; correct it")
+
+    def fault(self) -> str:
+        """What no camera can be beside its numbers, in words; "" for a possible camera."""
         if not 1 <= self.reduced_by <= MAX_REDUCTION:
             return f"images reduced by {self.reduced_by}"
-        if not (1 <= self.width <= MAX_SIDE_PX and 1 <= self.height <= MAX_SIDE_PX):
-            return f"an image of {self.width} x {self.height} pixels"
-        if min(self.fx, self.fy, self.depth_scale, self.fps, self.stereo_bf_px_m) < LEAST:
-            what = "a focal length, depth scale, rate or stereo_bf"
-            return f"{what} that is not positive, or below {LEAST:g}"
         if self.up not in ("", *SIDES):
             return f"up {self.up!r}, which is no side of an image"
         bad = self.not_in_image()
@@ -265,8 +266,7 @@ class Camera:
 
     def depth_bend(self, pixels: Array) -> Array:
         """What the sensor adds to the inverse depth (...) at raw pixels (..., 2), in 1/m."""
-        terms = depth_distortion_terms(self.image_places(pixels))
-        return np.asarray(terms @ np.array(self.depth_distortion))
+        return np.asarray(depth_distortion_terms(self.image_places(pixels)) @ self.depth_distortion)
 
     def project_stereo(self, points_camera: Array) -> Array:
         """Stereo measurements (..., 3) ``(u_left, v, u_right)`` of camera points (..., 3)."""

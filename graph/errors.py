@@ -2,7 +2,8 @@
 
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 MAX_MESSAGE = 2000
 MAX_LINE = 450
@@ -21,6 +22,15 @@ class InputError(Exception):
         if len(message) > MAX_MESSAGE:
             message = f"{message[: MAX_MESSAGE // 2]} ... {message[-MAX_MESSAGE // 2 :]}"
         super().__init__(message)
+
+
+@contextmanager
+def naming(where: str, cure: str) -> Iterator[None]:
+    """Put ``where`` before, and the ``cure`` after, what an InputError of the block says."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}; {cure}") from error
 
 
 def one_line(message: str) -> str:

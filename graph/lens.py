@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.errors import InputError
 
 UNDISTORTION_STEPS = 5
 
@@ -17,6 +18,18 @@ def columns(first: Array, *others: Array) -> Array:
     for number, column in enumerate((first, *others)):
         joined[..., number] = column
     return joined
+
+
+def five_terms(given: Sequence[float] | Array) -> tuple[float, float, float, float, float]:
+    """OpenCV's (k1, k2, p1, p2, k3) of five values or, where k3 is 0, of four. InputError."""
+    terms = given if isinstance(given, tuple) else np.ravel(given).tolist()
+    if len(terms) not in (4, 5):
+        raise InputError(
+            f"a camera with {len(terms)} values of distortion; give (k1, k2, p1, p2, k3) of "
+            "OpenCV, or undistort the images first"
+        )
+    k1, k2, p1, p2, k3 = (*terms, 0.0)[:5]
+    return k1, k2, p1, p2, k3
 
 
 def distort_normalised(normalised: Array, distortion: Sequence[float] | Array) -> Array:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, so3_log
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices
 
@@ -98,7 +99,8 @@ def align(points_estimate: Array, points_reference: Array, with_scale: bool = Fa
     partly free; any of the best ones is returned, and the remaining distances are unaffected.
 
     Raises:
-        ValueError: no points, or a scale asked for points that do not move.
+        ValueError: no points.
+        InputError: a scale asked for points that do not move.
     """
     if not len(points_estimate) or points_estimate.shape != points_reference.shape:
         raise ValueError(f"cannot align {points_estimate.shape} with {points_reference.shape}")
@@ -110,7 +112,7 @@ def align(points_estimate: Array, points_reference: Array, with_scale: bool = Fa
     if with_scale:
         variance = np.mean(np.sum(centred_e**2, axis=1))
         if variance < 1e-18:
-            raise ValueError("a scale cannot be found from a camera that does not move")
+            raise InputError("the estimate does not move, so no scale is found; omit --with-scale")
         scale = float(D @ S / variance)
     T = np.eye(4)
     T[:3, :3] = U @ (S[:, None] * Vt)
@@ -121,7 +123,11 @@ def align(points_estimate: Array, points_reference: Array, with_scale: bool = Fa
 def absolute_error(
     estimate: Trajectory, reference: Trajectory, with_scale: bool = False
 ) -> AbsoluteError:
-    """Absolute trajectory error of poses that belong together, after ``align``."""
+    """Absolute trajectory error of poses that belong together, after ``align``.
+
+    Raises:
+        InputError: ``with_scale`` for an estimate that does not move.
+    """
     alignment = align(estimate.positions_world, reference.positions_world, with_scale)
     aligned = alignment.apply(estimate)
     E = inverse(reference.poses_world_camera) @ aligned.poses_world_camera

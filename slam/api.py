@@ -10,6 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
+import numpy as np
+
 from bmask_slam.graph.errors import InputError
 from bmask_slam.run_folder.reader import Run
 
@@ -88,7 +90,7 @@ def run(
     if segmenter is not None:
         chosen = _segmenter_options(segmenter, resolved.semantics.segmenter)
         resolved = replace(resolved, semantics=replace(resolved.semantics, segmenter=chosen))
-    checked = from_tree(runner.RunOptions, _plain(given), "run()")
+    checked = from_tree(runner.RunOptions, _plain(given, "run()"), "run()")
     summary = runner.run(replace(checked, config=resolved, config_name=name))
     if summary.stopped_by is not None:
         signal.raise_signal(summary.stopped_by)
@@ -126,7 +128,7 @@ def map_run(
 
     given: dict[str, Any] = {"run": run, "mesh": mesh, "plan": plan, **options}
     quiet = bool(given.pop("quiet", True))
-    checked = from_tree(MapOptions, _plain(given), "map_run()")
+    checked = from_tree(MapOptions, _plain(given, "map_run()"), "map_run()")
     if segmenter is not None:
         checked = replace(checked, masks=_segmenter_options(segmenter, SegmenterOptions()))
     with counting_bar(quiet) as progress:
@@ -183,7 +185,8 @@ def _configuration(
             raise InputError("settings beside a SystemConfig: change its fields instead")
         return config, ""
     file = None if config is None else find_config(os.fspath(config))
-    lines = [f"{path}={json.dumps(value)}" for path, value in (settings or {}).items()]
+    given = {k: _plain_value(value, f"settings: {k}") for k, value in (settings or {}).items()}
+    lines = [f"{path}={json.dumps(value)}" for path, value in given.items()]
     return resolve(SystemConfig, file, lines), file.stem if file else ""
 
 
@@ -200,10 +203,29 @@ def _segmenter_options(given: str | SegmenterOptions, base: SegmenterOptions) ->
     return given
 
 
-def _plain(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The keyword arguments that are not None; a path, or a `Run`, as text."""
+def _plain(given: Mapping[str, Any], function: str) -> dict[str, Any]:
+    """The keyword arguments of a function that are not None, as values of JSON. InputError."""
     return {
-        name: os.fspath(value) if isinstance(value, os.PathLike) else value
+        name: _plain_value(value, f"{function}: {name}")
         for name, value in given.items()
         if value is not None
     }
+
+
+def _plain_value(value: object, where: str) -> Any:
+    """A value of JSON: a path, or a `Run`, as text, numbers of numpy as those of Python.
+
+    Raises:
+        InputError: an object of another kind, such as a `Camera`; ``where`` names the argument.
+    """
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _plain_value(item, where) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain_value(item, where) for item in value]
+    if value is None or isinstance(value, (str, int, float)):
+        return value
+    raise InputError(f"{where}: a {type(value).__name__}; give a text, a number or a file")

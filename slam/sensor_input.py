@@ -13,6 +13,7 @@ from bmask_slam.back_end.reinterpretation import KeyframeMotion, reinterpret_fra
 from bmask_slam.features.brisk import BriskExtractor
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.own_factors import own_factor
 from bmask_slam.graph.geometry import quaternion_from_rotation
 from bmask_slam.graph.sensors.streams import Measurements, measurements
 from bmask_slam.moving.moving_object_filter import MovingObjectFilter
@@ -119,7 +120,7 @@ class SensorSystem(SystemResults, SensorInput):
     def add_factor(self, factor: Any) -> int:
         """See `SensorInput.add_factor`; the graph is optimised at once."""
         number = self.mapper.smoother.tables.next_own
-        self._change_factors([(number, factor)], ())
+        self._change_factors([(number, own_factor(factor).factor)], ())
         return number
 
     def remove_factor(self, number: int) -> None:

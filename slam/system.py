@@ -20,7 +20,7 @@ from bmask_slam.moving.moving_object_filter import MovingObjectFilter
 from bmask_slam.moving.static_features import StaticFeatures
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.runtime.stage_clock import stage
-from bmask_slam.semantics.segmenters.segmenter import Segmenter, begin_early
+from bmask_slam.semantics.segmenters.segmenter import Segmenter, begin_early, check_segmenter
 from bmask_slam.sequences.frame import Frame, check_frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.system_state import SavedSystem
@@ -59,7 +59,12 @@ class SlamSystem(SavedSystem):
         """An empty map, in this process unless a back end is given.
 
         Without a segmenter nothing is labelled, and moving things are found by depth alone.
+
+        Raises:
+            InputError: the segmenter is a name or another object that is none.
         """
+        if segmenter is not None:
+            check_segmenter(segmenter)
         self.camera = camera
         self.config = config = config or SystemConfig()
         self.extractor = BriskExtractor(camera, config.features)

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from repository import ROOT
 
@@ -97,6 +98,11 @@ def test_every_option_has_a_keyword(keywords: type, options: type, named: set[st
         ({"max_frames": 2.5}, r"max_frames = 2.5 is not a whole number"),
         ({"overwrite": "yes"}, r"overwrite = .*yes.* is not true or false"),
         ({"out": 7}, r"run\(\): out = 7 is not a"),
+        (
+            {"camera": bmask_slam.Camera(640, 480, 525.0, 525.0, 319.5, 239.5)},
+            r"run\(\): camera: a Camera; give a .* file",
+        ),
+        ({"settings": {"covariances": object()}}, "settings: covariances: a object; give a"),
         ({"segmenter": "lite"}, "'lite': not known; there are: light, .*none"),
         ({"segmenter": object()}, "segmenter: a object; give a name"),
         ({"config": "no/such.yaml"}, r"no/such\.yaml: "),
@@ -113,6 +119,24 @@ def test_arguments_of_run_are_checked(
     with pytest.raises(bmask_slam.InputError, match=message):
         bmask_slam.run(recording, **{"out": tmp_path / "out", **options})
     assert not (tmp_path / "out").exists()
+
+
+def test_numbers_of_numpy_are_numbers(recording: Path, tmp_path: Path) -> None:
+    settings = {"tracking.min_inliers": np.int64(30), "features.layer_shares": np.ones(2) / 2}
+    whole = {"stride": np.int32(2), "max_frames": np.int64(1)}
+    out = tmp_path / "out"
+    run = bmask_slam.run(recording, out, segmenter="none", settings=settings, **whole)
+    assert len(run.frames) == 1
+    assert run.config.tracking.min_inliers == 30
+    assert run.config.features.layer_shares == (0.5, 0.5)
+
+
+def test_folders_of_a_live_run_may_be_texts() -> None:
+    options = bmask_slam.LiveOptions(out="runs/x", images="path/to/recording")
+    assert (options.out, options.images) == (Path("runs/x"), Path("path/to/recording"))
+    assert bmask_slam.LiveOptions().out is None
+    with pytest.raises(bmask_slam.InputError, match="LiveOptions: out is a int; give a path"):
+        bmask_slam.LiveOptions(out=7)
 
 
 def test_a_camera_and_a_frame_of_open_sequence_are_checked(recording: Path) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 
 import bmask_slam
 from bmask_slam.evaluation import evaluate_trajectory
+from bmask_slam.evaluation.recordings import read_parts
 from bmask_slam.graph.trajectory import Trajectory, read_tum
 from bmask_slam.rendering import sequence
 from bmask_slam.rendering.engine.builder import SceneBuilder
@@ -24,7 +25,6 @@ from bmask_slam.rendering.engine.meshes import pose
 from bmask_slam.rendering.engine.path import CameraPath
 from bmask_slam.rendering.rooms import office
 from bmask_slam.rendering.rooms.room import Room, ceiling_lamps, shell
-from bmask_slam.sequences.formats.joined import read_parts
 
 FPS = 15.0
 EYES, TARGETS = office.PATH.eyes_world, office.PATH.targets_world

@@ -14,7 +14,7 @@ from typing import Annotated, Any, TypeVar, cast
 import numpy as np
 from pydantic import ConfigDict, StringConstraints, TypeAdapter, ValidationError
 
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, naming
 from bmask_slam.graph.files.reading import read_bytes
 
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200)]
@@ -45,7 +45,8 @@ def parse_json(data: bytes | str, schema: type[Content], where: str, cure: str) 
 def check_json(value: Any, schema: type[Content], where: str, cure: str) -> Content:
     """A value of JSON that was parsed already, checked against ``schema``. Raises InputError."""
     try:
-        return _adapter(cast("Any", schema)).validate_python(value)
+        with naming(where, cure):  # a dataclass may check itself
+            return _adapter(cast("Any", schema)).validate_python(value)
     except ValidationError as error:
         raise InputError(f"{where}: {first_problem(error)}; {cure}") from error
 

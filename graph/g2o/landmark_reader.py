@@ -10,7 +10,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.errors import InputError, finite_number, whole_number
+from bmask_slam.graph.errors import InputError, finite_number, naming, whole_number
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.observability import component_labels
@@ -137,14 +137,12 @@ def _camera(rows: dict[str, Rows], notes: _Notes, path: Path) -> Camera:
             )
     fx, fy, cx, cy = intrinsics[0].tolist()
     bf = {"stereo_bf_px_m": fx * rows[STEREO].numbers[0][11]} if len(rows[STEREO]) else {}
-    camera = Camera(round(2 * cx + 1), round(2 * cy + 1), fx, fy, cx, cy, **bf)
-    if len(notes.camera) == 10:
+    with naming(str(path), f"correct {CAMERA} and {MARK} camera"):
+        if len(notes.camera) != 10:
+            return Camera(round(2 * cx + 1), round(2 * cy + 1), fx, fy, cx, cy, **bf)
         width, height, bf_px_m, depth_scale, fps, k1, k2, p1, p2, k3 = notes.camera
         rest = (k1, k2, p1, p2, k3), depth_scale, fps, bf_px_m
-        camera = Camera(round(width), round(height), fx, fy, cx, cy, *rest)
-    if fault := camera.fault():
-        raise InputError(f"{path}: its camera has {fault}; correct {CAMERA} and {MARK} camera")
-    return camera
+        return Camera(round(width), round(height), fx, fy, cx, cy, *rest)
 
 
 def _check_parameters(edge: str, parameter: str, rows: dict[str, Rows], path: Path) -> None:

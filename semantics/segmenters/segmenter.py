@@ -22,6 +22,7 @@ INSTANCES_A_CLASS = 1000
 """In a label PNG, value = 1000 * label + instance; a value below 1000 is a label."""
 
 
+@runtime_checkable
 class Segmenter(Protocol):
     """Finds instances in images; ``labels`` is the set of their labels."""
 
@@ -33,6 +34,16 @@ class Segmenter(Protocol):
         ``name`` is the image's file name relative to its sequence, for look-ups and errors. A
         segmenter that also tells what all pixels are gives a ``Segmented``.
         """
+
+
+def check_segmenter(given: object) -> None:
+    """Raise InputError for what finds no instances, such as the name of a segmenter."""
+    if not isinstance(given, Segmenter):
+        what = repr(given) if isinstance(given, str) else f"a {type(given).__name__}"
+        raise InputError(
+            f"segmenter: {what}; give what make_segmenter makes of it, or an object with labels "
+            "and segment()"
+        )
 
 
 @runtime_checkable

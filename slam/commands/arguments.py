@@ -27,6 +27,8 @@ DETAILS = (
 """Figures of metrics.json that are not printed; nor are those of the graph."""
 SEGMENTERS = "light, mask-scoring-rcnn, precomputed, truth, none, or module:Class of your own"
 
+SEGMENTER_OPTIONS = ("segmenter", "weights", "proposals", "masks", "ray", "labels")
+
 
 def add_output_arguments(parser: argparse.ArgumentParser, short: str) -> None:
     """Add --quiet, which prints only ``short``, and --json."""
@@ -118,7 +120,7 @@ class ChosenConfig:
     Attributes:
         config: of the system.
         name: of its file, without the suffix; "" without a file.
-        is_default: nothing was asked for.
+        is_default: nothing was asked for, not even what is the default.
     """
 
     config: SystemConfig
@@ -146,7 +148,8 @@ def chosen_config(arguments: argparse.Namespace) -> ChosenConfig:
     plain = resolve(SystemConfig, file, settings)
     segmenter = segmenter_options(arguments, plain.semantics.segmenter)
     config = replace(plain, semantics=replace(plain.semantics, segmenter=segmenter))
-    is_default = not (file or settings) and config == plain
+    given = any(getattr(arguments, name) is not None for name in SEGMENTER_OPTIONS)
+    is_default = not (file or settings or given)
     return ChosenConfig(config, file.stem if file else "", is_default)
 
 

@@ -145,7 +145,7 @@ def _run_or_resume(arguments: argparse.Namespace, chosen: ChosenConfig) -> RunSu
 def _plain_summary(summary: RunSummary) -> dict[str, Any]:
     """What --json prints."""
     stopped_by = summary.stopped_by.name if summary.stopped_by else None
-    told = {"folder": summary.folder, "finished": not summary.resumable, "stopped_by": stopped_by}
+    told = {"folder": summary.folder, "finished": not stopped_by, "stopped_by": stopped_by}
     names = ("frames", "skipped", "calibration", "warnings")
     told |= {name: getattr(summary, name) for name in names}
     return told | {"metrics": summary.rows}

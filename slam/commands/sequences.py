@@ -84,23 +84,24 @@ def add_info(commands: Commands) -> None:
     text = "say what a sequence holds: frames, camera, depth, ground truth; of a bag its topics"
     parser = commands.add_parser("info", help=text, description=text)
     parser.set_defaults(handler=_info)
-    parser.add_argument("sequence", type=Path, help="recording, or ROS bag")
+    parser.add_argument("sequence", type=Path, help="recording, ROS bag, or run of one")
     add_camera_argument(parser)
     parser.add_argument("--json", action="store_true", help="print it as JSON")
 
 
 def _info(arguments: argparse.Namespace) -> int:
     from bmask_slam.graph.files.json_file import format_json
+    from bmask_slam.run_folder.origin import recording_of
     from bmask_slam.sequences.bags.bag_file import format_topics, is_bag, open_bag
     from bmask_slam.sequences.info import format_info, info_as_json, sequence_info
     from bmask_slam.sequences.sequence import open_sequence
 
-    if is_bag(arguments.sequence):
-        with open_bag(arguments.sequence) as bag:
+    source, camera = recording_of(arguments.sequence), arguments.camera
+    if is_bag(source):
+        with open_bag(source) as bag:
             topics = {"duration_s": bag.duration_s, "topics": list(bag.topics)}
             print(format_json(topics) if arguments.json else format_topics(bag))
         return 0
-    source, camera = arguments.sequence, arguments.camera
     info = sequence_info(open_sequence(source, camera=camera, full_size=arguments.full_size))
     print(info_as_json(info) if arguments.json else format_info(info))
     return 0

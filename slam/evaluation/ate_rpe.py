@@ -10,6 +10,7 @@ from typing import TypedDict
 
 import numpy as np
 
+from bmask_slam.evaluation.recordings import OVERLAPPING, MergedClock, merged_clock
 from bmask_slam.evaluation.reference import file_in, read_reference, reference_file
 from bmask_slam.events import read_events
 from bmask_slam.graph.arrays import Array
@@ -87,7 +88,8 @@ def evaluate_trajectory(
     number of frames that the system was given, adds the share that it tracked.
 
     Raises:
-        InputError: fewer than three poses are associated.
+        InputError: fewer than three poses are associated, or ``with_scale`` for an estimate that
+            does not move.
     """
     matched, truth = associate(estimate, reference, max_time_difference_s)
     if not len(estimate):
@@ -126,21 +128,21 @@ def evaluate(
     Trajectories are in the format of TUM, EuRoC or KITTI; stamps of the latter are read from the
     file ``times``, or are those of the run's frames. ``plot`` shows a run's events. ``with_body``:
     the reference is of another body, such as markers or an IMU, whose pose on the camera is
-    estimated.
+    estimated. A merged run has its recordings' own stamps; where these overlap it warns instead.
 
     Raises:
-        InputError: a missing or broken file, trajectories without common times, or ``with_body``
-            with a camera that does not turn or whose scale is unknown.
+        InputError: a missing or broken file, trajectories without common times, ``with_scale`` for
+            an estimate at rest, or ``with_body`` for one that does not turn or has no known scale.
     """
     if with_body and with_scale:
         raise InputError("--hand-eye with --with-scale: a body's place needs metres; leave one out")
-    run_or_trajectory, reference = Path(run_or_trajectory), Path(reference)
+    run_or_trajectory, truth_file = Path(run_or_trajectory), reference_file(Path(reference))
     file = file_in(run_or_trajectory, "trajectory.txt", "a run folder or a trajectory file")
-    truth_file = reference_file(reference)
-    frames_s = frame_stamps(file)
+    frames_s, clock = frame_stamps(file), _clock_of(file)
     stamps_s = read_times(times) if times else frames_s
-    estimate, truth = read_trajectory(file, stamps_s), read_reference(truth_file, stamps_s)
-    frames = None if frames_s is None else len(frames_s)
+    frames = 0 if frames_s is None else len(frames_s)
+    estimate = clock.own_trajectory(read_trajectory(file, stamps_s))
+    truth = read_reference(truth_file, stamps_s)
     try:
         estimate, body = _of_body(estimate, truth) if with_body else (estimate, [])
         result = evaluate_trajectory(estimate, truth, frames, with_scale)
@@ -150,7 +152,7 @@ def evaluate(
     if plot is not None:
         from bmask_slam.evaluation.plot import plot_trajectory  # noqa: PLC0415 - matplotlib loads slowly
 
-        events = () if frames_s is None else read_events(file.parent)
+        events = [] if frames_s is None else clock.own_events(read_events(file.parent))
         plot_trajectory(plot, estimate, truth, run_or_trajectory.resolve().stem, events, with_scale)
     return result
 
@@ -159,6 +161,14 @@ def _of_body(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, list[
     """The estimate as the trajectory of the reference's body, and rows with its pose."""
     T_camera_body = hand_eye(*associate(estimate, truth))
     return body_trajectory(estimate, T_camera_body), _body_rows(T_camera_body)
+
+
+def _clock_of(file: Path) -> MergedClock:
+    """The clock of the run of a trajectory.txt; warns where moved stamps stay as they are."""
+    clock = merged_clock(file.parent) if file.name == "trajectory.txt" else MergedClock()
+    if clock.overlapping:
+        logger.warning(OVERLAPPING, file)
+    return clock
 
 
 def frame_stamps(trajectory_file: Path) -> Array | None:

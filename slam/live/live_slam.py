@@ -172,8 +172,10 @@ class LiveSlam(LiveMap):
 
         Raises:
             InputError: a frame that ``check_frame`` or ``SourceClock`` refuses. It is not used; the
-                next one may be.
+                next one may be. After ``close`` all are refused.
         """
+        if self._closed:
+            raise InputError("track: this LiveSlam is closed; track frames in its with block")
         arrived_s = time.monotonic() if prepared is None else prepared.arrived_s
         if not self._meter.frames:
             self._begin_s = arrived_s

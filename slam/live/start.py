@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import NoneType
 from typing import TYPE_CHECKING
 
 from bmask_slam.calibration.adoption import BENDS, CALIBRATE, SelfCalibrationConfig
@@ -40,7 +42,7 @@ class LiveOptions:
     """What a live run writes and shows, and what it is compared with.
 
     Attributes:
-        out: run folder, as an offline run's; None: nothing is written.
+        out: run folder, as an offline run's, also as text; None: nothing is written.
         overwrite: replace the run that ``out`` holds.
         reference: trajectory to compare with at the end.
         view: where a viewer shows the run, if at all.
@@ -82,6 +84,11 @@ class LiveOptions:
     full_size: bool = False
 
     def __post_init__(self) -> None:
+        for name in ("out", "images"):
+            given = getattr(self, name)
+            if not isinstance(given, (str, os.PathLike, NoneType)):
+                raise InputError(f"LiveOptions: {name} is a {type(given).__name__}; give a path")
+            object.__setattr__(self, name, given if given is None else Path(given))
         if self.calibrate not in CALIBRATE:
             raise InputError(f"--calibrate {self.calibrate}: is not one of {', '.join(CALIBRATE)}")
 

@@ -15,19 +15,26 @@ import numpy as np
 
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation import Row
+from bmask_slam.evaluation.recordings import JOINED, write_parts
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.merging.common_places import CommonPlaces, MergeConfig, PlaceSearch
 from bmask_slam.merging.joining import Step, join, join_objects
 from bmask_slam.merging.joint_state import joint_state
-from bmask_slam.merging.report import MergeSummary, PairSearch, line_of, no_place, rows_of
+from bmask_slam.merging.report import (
+    MergeSummary,
+    PairSearch,
+    line_of,
+    moved_lines,
+    no_place,
+    rows_of,
+)
 from bmask_slam.merging.sources import SLACK_S, Source, read_sources
 from bmask_slam.run_folder.folder import DENSE, RunFolder
 from bmask_slam.run_folder.frame_file import FRAMES
 from bmask_slam.run_folder.map_file import MAP
 from bmask_slam.run_folder.metrics import row, save
 from bmask_slam.run_folder.origin import Origin
-from bmask_slam.sequences.formats.joined import JOINED, write_parts
 from bmask_slam.system import SlamSystem
 
 logger = logging.getLogger(__name__)
@@ -65,7 +72,7 @@ def merge_runs(options: MergeOptions) -> MergeSummary:
     system = _system(sources)
     _report_frame(system, sources)
     found = _common_places(system, sources, options.config)
-    lines = tuple(line_of(pair, sources, options.config) for pair in found)
+    lines = *(line_of(pair, sources, options.config) for pair in found), *moved_lines(sources)
     tree, others = _plan(system, sources, found, options.config)  # refused before OUT is touched
     with RunFolder(options.out, options.overwrite) as folder:
         logger.info("merged: %s", shlex.join(sys.argv))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +25,8 @@ class MergeSummary:
     Attributes:
         folder: the run folder.
         rows: what metrics.json holds.
-        lines: what was found between the runs, a line each.
+        lines: what was found between the runs, and which of them had their stamps moved, a line
+            each.
     """
 
     folder: Path
@@ -87,6 +88,16 @@ def line_of(pair: PairSearch, sources: Sequence[Source], config: MergeConfig) ->
     if best.tested:
         text += f"; {best.confirmed} of {best.tested} views that both should have are the same"
     return text + (f"; not used: {fault}" if (fault := best.fault(config)) else "")
+
+
+def moved_lines(sources: Sequence[Source]) -> Iterator[str]:
+    """A line for each run whose stamps were moved."""
+    for source in sources:
+        if source.shift.stamp_s:
+            yield (
+                f"{source.path.name}: {source.shift.stamp_s:+g} s to its stamps in trajectory.txt, "
+                "since it does not begin after the run before it"
+            )
 
 
 def rows_of(

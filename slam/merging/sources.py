@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.config.configuration import resolve
+from bmask_slam.evaluation.recordings import Part, is_joined, read_parts
 from bmask_slam.events import Event, read_events
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import NO_DEPTH_DISTORTION, Camera
@@ -21,7 +22,6 @@ from bmask_slam.run_folder.folder import CHECKPOINT
 from bmask_slam.run_folder.frame_file import COLUMNS, FRAMES, FrameTable, read_frames
 from bmask_slam.run_folder.map_file import MAP, read_map
 from bmask_slam.run_folder.origin import CONFIG, find_sequence
-from bmask_slam.sequences.formats.joined import Part, is_joined, read_parts
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.system_results import checked_state

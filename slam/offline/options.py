@@ -132,7 +132,7 @@ def _absolute(path: Path) -> Path:
 
 def _words(option: str, own: object) -> str:
     """An option's value that a run was started with, in words."""
-    if own is None or isinstance(own, bool):
+    if option not in _PATHS and (own is None or isinstance(own, bool)):
         return f"{'with' if own else 'without'} {_flag(option)}"
     return "with another configuration" if option == "config" else f"with {own}"
 

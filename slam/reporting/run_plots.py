@@ -1,26 +1,19 @@
-"""Drawings of a run's report: features and times over the frames, the path, the errors."""
+"""Drawings of a run's report: features and times over the frames."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 
-from bmask_slam.evaluation.plot import draw_errors, draw_events, draw_top_view
-from bmask_slam.events import Event
 from bmask_slam.graph.arrays import Array, Ints
-from bmask_slam.graph.metrics import absolute_error
-from bmask_slam.graph.trajectory import Trajectory, associate
 from bmask_slam.reporting.drawing import COLOURS, as_picture, figure
 from bmask_slam.reporting.parts import Picture
 from bmask_slam.run_folder.frame_file import STAGES, FrameTable
 from bmask_slam.tracking.results import TrackingStatus
 
-WIDTH_IN, LOW_IN, HIGH_IN = 4.4, 3.0, 4.2
+WIDTH_IN, LOW_IN = 4.4, 3.0
 MAX_BINS, TIME_BINS = 300, 60
 STAGE_COLOURS = (*COLOURS[:6], "#8c8c86")
-MIN_POSES = 3
 SHADES = {TrackingStatus.LOST: (COLOURS[1], 0.35), TrackingStatus.WEAK: (COLOURS[5], 0.3)}
 
 
@@ -68,41 +61,6 @@ def time_picture(frames: FrameTable) -> Picture:
             f"the camera gives a frame every {interval_ms:.0f} ms."
         )
         return as_picture(drawn, "Time of each stage", caption)
-
-
-def path_pictures(
-    trajectory: Trajectory, events: Sequence[Event], reference: Trajectory | None
-) -> list[Picture]:
-    """The path from above with events; with a reference aligned to it, and the errors."""
-    if not len(trajectory):
-        return []
-    matched, truth = (trajectory, None) if reference is None else associate(trajectory, reference)
-    if truth is None or len(truth) < MIN_POSES:
-        caption = "The path in the plane in which the camera moved most, in the run's world frame."
-        return [_path_picture(trajectory, events, None, None, caption)]
-    error = absolute_error(matched, truth)
-    rmse_mm = 1000 * error.translation_m.rmse
-    caption = f"Aligned with the reference by SE(3): ATE {rmse_mm:.1f} mm over {len(truth)} poses."
-    aligned = error.alignment.apply(trajectory)
-    found = [_path_picture(aligned, events, reference, (error.aligned, truth), caption)]
-    with figure(WIDTH_IN, HIGH_IN) as drawn:
-        draw_errors(list(drawn.subplots(2, 1)), error)
-        caption = "Translation and rotation error of each pose after the alignment."
-        return [*found, as_picture(drawn, "Errors over time", caption)]
-
-
-def _path_picture(
-    shown: Trajectory,
-    events: Sequence[Event],
-    reference: Trajectory | None,
-    ends: tuple[Trajectory, Trajectory] | None,
-    caption: str,
-) -> Picture:
-    with figure(WIDTH_IN, HIGH_IN) as drawn:
-        axes = drawn.add_subplot()
-        draw_top_view(axes, shown, reference, ends)
-        draw_events(axes, events, shown, reference)
-        return as_picture(drawn, "The camera's path", caption)
 
 
 def _shade_status(axes: Axes, frames: FrameTable, time_s: Array) -> None:

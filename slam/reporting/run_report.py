@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from bmask_slam.evaluation import read_reference
+from bmask_slam.evaluation.recordings import JOINED, OVERLAPPING, MergedClock, merged_clock
 from bmask_slam.events import EventKind
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.whole_file import whole_file
@@ -21,15 +20,14 @@ from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.reporting.metric_table import BY_NAME
 from bmask_slam.reporting.page import Page, page_text
 from bmask_slam.reporting.parts import Entry, Listing, Picture, Section, Table, TableRow, Tile
+from bmask_slam.reporting.path_errors import find_reference, path_pictures, with_errors
 from bmask_slam.reporting.picture_files import read_picture
-from bmask_slam.reporting.run_plots import frame_pictures, path_pictures
+from bmask_slam.reporting.run_plots import frame_pictures
 from bmask_slam.run_folder.folder import REPORT
 from bmask_slam.run_folder.frame_file import STAGES, FrameTable
 from bmask_slam.run_folder.reader import Metric, Run
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import TrackingStatus
-
-logger = logging.getLogger(__name__)
 
 PICTURES = {
     "film.gif": "The run as a film",
@@ -76,16 +74,16 @@ def write_run_report(folder: Path, out: Path | None = None, reference: Path | No
 
     None: report.html in the run's folder. A part whose files are missing is left out; one whose
     files are broken is named under the page's warnings. ``reference``: a trajectory or a sequence
-    with one; None: that of the run's sequence, if it is there. The same files give the same bytes.
+    with one, against which all errors are; None: that of the run's sequence, if it is there, and
+    the errors of metrics.json. The same files give the same bytes.
 
     Raises:
-        InputError: no run, a reference that cannot be read, or a page that cannot be written.
+        InputError: no run, a broken reference or one of other times, or a page that is not written.
     """
     run, path = Run(folder), folder / REPORT if out is None else out
     if not path.parent.is_dir():
         raise InputError(f"{path.parent}: no such folder for the report; make it first")
-    report = _RunReport(run, None if reference is None else read_reference(reference))
-    text = page_text(report.page())
+    text = page_text(_RunReport(run, reference).page())
     with whole_file(path) as temporary:
         temporary.write_bytes(text.encode("utf-8", "replace"))
     return path
@@ -94,13 +92,21 @@ def write_run_report(folder: Path, out: Path | None = None, reference: Path | No
 class _RunReport:
     """Reads the parts of a run; what is broken becomes a warning."""
 
-    def __init__(self, run: Run, reference: Trajectory | None) -> None:
-        self._run, self._reference = run, reference
+    def __init__(self, run: Run, given: Path | None) -> None:
+        self._run, self._given = run, given
+        self._reference = find_reference(run, given)
         self._broken: list[str] = []
+        merged = given and self._try(JOINED, lambda: merged_clock(run.path))
+        self._clock = merged or MergedClock()
+        if self._clock.overlapping:
+            self._broken.append(OVERLAPPING % run.path)
 
     def page(self) -> Page:
         """The whole page; the warnings are put together last."""
         metrics = self._try("metrics.json", lambda: self._run.metrics) or {}
+        if self._given and self._reference:
+            files = self._run.path / "trajectory.txt", self._given
+            metrics = with_errors(metrics, self._path(), self._reference, files)
         tiles = self._tiles(metrics)
         sections = [
             Section("Path and frames", pictures=tuple(self._plots())),
@@ -124,10 +130,17 @@ class _RunReport:
             self._broken.append(str(error))
             return None
 
+    def _path(self) -> Trajectory | None:
+        """The trajectory, by the stamps of a given reference."""
+        path = self._try("trajectory.txt", lambda: self._run.trajectory)
+        return None if path is None else self._clock.own_trajectory(path)
+
     def _lead(self) -> str:
         sequence = self._run.sequence
         what = f"a run of bmask-slam on {sequence}" if sequence else "a live run of bmask-slam"
-        return what[0].upper() + what[1:] + ("." if self._run.is_finished else "; not finished.")
+        what += "" if self._run.is_finished else "; not finished"
+        what += "" if self._given is None else f"; errors against {self._given}"
+        return f"{what[0].upper()}{what[1:]}."
 
     def _warnings(self) -> Section:
         """What the log warns of, and what could not be read."""
@@ -157,13 +170,8 @@ class _RunReport:
 
     def _plots(self) -> list[Picture]:
         """The path with the errors, if there is a reference, and plots over the frames."""
-        if self._reference is None and self._run.sequence is not None:
-            try:
-                self._reference = read_reference(self._run.sequence)
-            except InputError as error:  # a sequence without one, or one that was moved
-                logger.info("no reference: %s", error)
-        events = self._try("events.csv", lambda: self._run.events) or ()
-        path = self._try("trajectory.txt", lambda: self._run.trajectory)
+        events = self._clock.own_events(self._try("events.csv", lambda: self._run.events) or ())
+        path = self._path()
         frames = self._try("frames.csv", lambda: self._run.frames)
         drawn = [] if path is None else path_pictures(path, events, self._reference)
         return drawn + ([] if frames is None else frame_pictures(frames))
@@ -227,7 +235,8 @@ class _RunReport:
         units = {name: "" if m.unit in (name, "1") else m.unit for name, m in metrics.items()}
         width = max(map(len, units.values()), default=0)
         text = "\n".join(f"{m.value:>11.6g} {units[n]:<{width}} {n}" for n, m in metrics.items())
-        listings = (Listing("metrics.json", text),) if metrics else ()
+        title = "metrics.json" if self._given is None else f"metrics.json, and {self._given}"
+        listings = (Listing(title, text),) if metrics else ()
         return Section("Numbers", tables=tuple(tables), listings=listings)
 
     def _files(self) -> Section:

@@ -43,6 +43,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 
+from bmask_slam.evaluation.recordings import JOINED
 from bmask_slam.events import EVENT_COLUMNS, EVENTS, Event, event_row
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_lock import lock_file
@@ -56,7 +57,6 @@ from bmask_slam.run_folder.landmark_file import MARKERS
 from bmask_slam.run_folder.open_files import LOG, OpenFiles
 from bmask_slam.run_folder.semantic_files import SEMANTIC_FILES
 from bmask_slam.runtime.memory import is_out_of_memory
-from bmask_slam.sequences.formats.joined import JOINED
 from bmask_slam.tracking.results import FrameResult
 
 FILES = (

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bmask_slam import __version__
+from bmask_slam.evaluation.recordings import JOINED
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import is_folder
 from bmask_slam.graph.files.reading import read_text
@@ -64,6 +65,13 @@ def _is_there(sequence: Path) -> bool:
         return is_folder(file) or (is_recording_file(sequence) and file.is_file())
     except OSError:  # no name that a file can have
         return False
+
+
+def recording_of(path: Path) -> Path:
+    """The recording itself, or that of a run's folder; of a merged run its recordings.json."""
+    if is_folder(path) and (path / JOINED).is_file():
+        return path / JOINED
+    return read_origin(path).sequence or path if is_folder(path) else path
 
 
 def find_sequence(run: Path) -> Path:

@@ -21,11 +21,7 @@ from bmask_slam.graph.sensors.markers import MarkerMap
 from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, Trajectory, nearest_indices, read_tum
 from bmask_slam.run_folder.covariance_file import COVARIANCES, read_covariances
 from bmask_slam.run_folder.folder import CHECKPOINT, DENSE, FILES, trajectory_files
-from bmask_slam.run_folder.frame_file import (
-    FRAMES,
-    FrameTable,
-    read_frames,
-)
+from bmask_slam.run_folder.frame_file import FRAMES, FrameTable, read_frames
 from bmask_slam.run_folder.landmark_file import (
     LANDMARKS,
     MARKERS,
@@ -40,6 +36,9 @@ from bmask_slam.run_folder.semantic_files import OBJECTS, SavedObject, read_obje
 
 if TYPE_CHECKING:
     from bmask_slam.system_config import SystemConfig
+
+STOPPED = "stopped_after"
+"""Of metrics.json: the frames after which a signal ended a run; not in that of a whole run."""
 
 
 class Metric(NamedTuple):
@@ -107,8 +106,10 @@ class Run:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the run came to its end and wrote all its results."""
-        return (self.path / "metrics.json").is_file() and not (self.path / CHECKPOINT).exists()
+        """Whether the run came to its end, was not stopped before, and wrote all its results."""
+        path = self.path / "metrics.json"
+        whole = path.is_file() and not (self.path / CHECKPOINT).exists()
+        return whole and f'"{STOPPED}"' not in read_text(path, self._again())
 
     @cached_property
     def trajectory(self) -> Trajectory:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bmask_slam.graph.camera import MAX_SIDE_PX, NO_DEPTH_DISTORTION, SIDES, Camera, DepthNoise
-from bmask_slam.graph.errors import InputError, did_you_mean
+from bmask_slam.graph.errors import InputError, did_you_mean, naming
 from bmask_slam.graph.files.whole_file import whole_file, writing
 from bmask_slam.graph.files.yaml_file import format_yaml, read_yaml
 from bmask_slam.sequences.camera_presets import (
@@ -141,7 +141,7 @@ def _read(path: Path) -> tuple[Camera, set[str]]:
     numbers = {k: _number(path, k, v) for k, v in values.items() if k not in OTHERS}
     _check_range(path, numbers)
     optional = {name: numbers[key] for key, name in OPTIONAL.items() if key in numbers}
-    camera = Camera(
+    parts: dict[str, Any] = dict(
         width=int(numbers["width"]),
         height=int(numbers["height"]),
         **{key: numbers[key] for key in ("fx", "fy", "cx", "cy", "depth_scale")},
@@ -153,6 +153,8 @@ def _read(path: Path) -> tuple[Camera, set[str]]:
         reduced_by=1,
         **optional,
     )
+    with naming(str(path), f"write it as in {CAMERA_EXAMPLE}"):
+        camera = Camera(**parts)
     if bad := camera.not_in_image():
         raise InputError(f"{path}: covered has {bad}, no part of the image; {COVERED_CURE}")
     return camera, set(values)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.json_file import format_json
 from bmask_slam.graph.trajectory import associate_stamps
 from bmask_slam.sequences.sequence import Sequence
 
@@ -24,7 +25,7 @@ class SequenceInfo:
 
     Attributes:
         frames: colour/depth pairs.
-        fps_hz: from the typical step between stamps.
+        fps_hz: from the typical step between stamps; NaN for a single frame.
         gaps: (stamp in seconds, length in seconds) of steps over three times the typical one.
         camera, camera_source: intrinsics and their source.
         depth_valid_share: share of pixels with depth in a few frames spread over the sequence.
@@ -90,7 +91,7 @@ def format_info(info: SequenceInfo) -> str:
         truth = f"{share:.1f} % of the frames, path of {info.groundtruth_length_m:.2f} m"
     rows = (
         ("sequence", f"{info.folder}"),
-        ("frames", f"{info.frames} in {info.duration_s:.2f} s, {info.fps_hz:.2f} Hz"),
+        ("frames", f"{info.frames} in {info.duration_s:.2f} s, {_told(info.fps_hz)} Hz"),
         ("gaps", gaps),
         ("unpaired images", f"{info.unpaired_rgb} colour, {info.unpaired_depth} depth"),
         ("broken frames", f"{info.broken}"),
@@ -103,17 +104,20 @@ def format_info(info: SequenceInfo) -> str:
         ("depth distortion", " ".join(f"{k:g}" for k in c.depth_distortion)),
         ("depth scale", f"{c.depth_scale:g} to the metre"),
         ("valid depth", f"{100 * info.depth_valid_share:.1f} % of the pixels"),
-        ("depth (m)", f"5 % {low_m:.2f}, median {middle_m:.2f}, 95 % {high_m:.2f}"),
+        ("depth (m)", f"5 % {_told(low_m)}, median {_told(middle_m)}, 95 % {_told(high_m)}"),
         ("ground truth", truth),
     )
     return "\n".join(f"{name:<16} {value}" for name, value in rows)
 
 
+def _told(value: float) -> str:
+    """A number with two decimals, or that it is not known."""
+    return "unknown" if math.isnan(value) else f"{value:.2f}"
+
+
 def info_as_json(info: SequenceInfo) -> str:
     """The information as JSON, by the names of `SequenceInfo`; null for what is not known."""
-    found = asdict(info)
-    found["depth_percentiles_m"] = [None if np.isnan(v) else v for v in info.depth_percentiles_m]
-    return json.dumps(found, indent=1, default=lambda v: getattr(v, "tolist", v.__str__)())
+    return format_json(info)
 
 
 def _depth_statistics(sequence: Sequence, count: int) -> tuple[float, tuple[float, float, float]]:

@@ -13,6 +13,7 @@ from bmask_slam.graph.camera import (
     direction_of,
     side_towards,
 )
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.lens import distort_normalised, distortion_terms
 
 CAMERA = Camera(640, 480, fx=525.0, fy=510.0, cx=318.5, cy=241.5, stereo_bf_px_m=40.0)
@@ -175,3 +176,28 @@ def test_turned_by_its_side_a_camera_has_up_at_the_top(side: str) -> None:
         dataclasses.replace(CAMERA, up="above").fault()
         == "up 'above', which is no side of an image"
     )
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"fx": -500.0}, "focal length.* of -500, which is not positive"),
+        ({"fy": 0.0}, "focal length.* of 0, which is not positive"),
+        ({"depth_scale": 0.0}, "depth scale.* not positive"),
+        ({"cx": np.nan}, "not finite"),
+        ({"width": 0}, "an image of 0 x 480 pixels"),
+        ({"distortion": (0.1,) * 8}, "8 values of distortion; give .k1, k2, p1, p2, k3. of OpenCV"),
+        ({"distortion": ()}, "0 values of distortion"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused(changed: dict[str, object], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        dataclasses.replace(CAMERA, **changed)
+
+
+@pytest.mark.parametrize("four", [(0.1, -0.2, 0.01, 0.02), np.array([[0.1, -0.2, 0.01, 0.02]])])
+def test_four_values_of_distortion_are_five_with_the_last_0(four: object) -> None:
+    camera = dataclasses.replace(CAMERA, distortion=four)
+    assert camera == dataclasses.replace(CAMERA, distortion=(0.1, -0.2, 0.01, 0.02, 0.0))
+    expected, _ = cv2.projectPoints(POINTS, np.zeros(3), np.zeros(3), camera.K, np.ravel(four))
+    np.testing.assert_allclose(camera.project_distorted(POINTS), expected[:, 0], rtol=1e-12)

@@ -26,6 +26,14 @@ from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 
+@pytest.mark.parametrize(
+    ("given", "words"), [("none", "segmenter: 'none'; give what make_seg"), (7, "a int; give what")]
+)
+def test_what_is_no_segmenter_is_refused(given: object, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        SlamSystem(CAMERA, segmenter=given)
+
+
 def path(count: int, start_x_m: float = -0.6) -> list[Array]:
     """Camera poses sideways along the plane, 2 cm a frame, turning a little."""
     steps = np.arange(count)

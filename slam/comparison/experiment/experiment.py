@@ -103,7 +103,7 @@ class Experiment:
         seeds: of the system, and of the images of rendered sequences.
         systems: other systems by name.
         published: figures from the literature.
-        with_scale: align all runs by Sim(3).
+        with_scale: align all runs by Sim(3), and the trajectories of all other systems.
         max_time_difference_s: largest difference of the stamps of associated poses.
         verdicts: metrics by which configurations are judged.
         networks: folders of trained networks by name, whose curves the report draws.
@@ -122,3 +122,7 @@ class Experiment:
     max_time_difference_s: float = MAX_TIME_DIFFERENCE_S
     verdicts: tuple[str, ...] = VERDICT_METRICS
     networks: dict[str, Path] = field(default_factory=dict)
+
+    def aligned_with_scale(self, system: str) -> bool:
+        """Whether the trajectories of another system are aligned by Sim(3)."""
+        return self.with_scale or self.systems[system].with_scale

@@ -29,7 +29,7 @@ class CompareOptions:
         seeds, sequences, configurations: those to use; None for all.
         workers: jobs at a time; None: as many as there are cores.
         ray: address of a Ray cluster to use instead of this machine.
-        with_scale: align all runs by Sim(3), also if the experiment does not.
+        with_scale: align all runs and trajectories by Sim(3), also if the experiment does not.
         quiet: no progress bar.
     """
 

@@ -24,7 +24,7 @@ def trajectory_cells(
     for (method, key), file in files.items():
         name, _, seed = key.partition("@")
         data = find_data(name, int(seed) if seed.isdigit() else None)
-        rules = Rules(experiment.max_time_difference_s, experiment.systems[method].with_scale)
+        rules = Rules(experiment.max_time_difference_s, experiment.aligned_with_scale(method))
         cell = Cell(name, method, data.seed, CellStatus.PENDING)
         if file is None:
             name_in_file = experiment.systems[method].trajectories[key]
@@ -73,7 +73,7 @@ def published_cells(experiment: Experiment) -> Iterator[Cell]:
 def other_methods(experiment: Experiment) -> Iterator[Method]:
     """The rows after this system's own."""
     for name, system in experiment.systems.items():
-        yield Method(name, Kind.TRAJECTORY, system.note, system.with_scale)
+        yield Method(name, Kind.TRAJECTORY, system.note, experiment.aligned_with_scale(name))
     for name in dict.fromkeys(q.method for q in experiment.published):
         with_scale = any(q.with_scale for q in experiment.published if q.method == name)
         yield Method(name, Kind.PUBLISHED, with_scale=with_scale)

@@ -16,8 +16,9 @@ from bmask_slam.live.sources.cameras.opencv_camera import OpenCvSource
 from bmask_slam.live.sources.cameras.realsense_camera import RealSenseSource
 from bmask_slam.live.sources.cameras.record3d_camera import Record3dSource
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
+from bmask_slam.live.sources.recorded_source import RecordedSource
 from bmask_slam.live.sources.ros2_source import Ros2Options, Ros2Source
-from bmask_slam.live.sources.source import Limited, RecordedSource, Reduced, Source, Wrapped
+from bmask_slam.live.sources.source import Limited, Reduced, Source, Wrapped
 from bmask_slam.sequences.bags.bag_file import is_bag
 from bmask_slam.sequences.bags.sensors import SensorTopics
 from bmask_slam.sequences.bags.topics import BagTopics

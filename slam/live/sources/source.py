@@ -1,4 +1,4 @@
-"""The protocol of a source of live frames, recordings as sources, and what drops old frames."""
+"""The protocol of a source of live frames, their pace, and what drops old frames."""
 
 from __future__ import annotations
 
@@ -6,18 +6,14 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import closing
 from dataclasses import asdict, dataclass
 from itertools import islice
 from typing import Generic, Protocol, TypeVar
-
-import numpy as np
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.sequences.frame import Frame, reduced_frame
 from bmask_slam.sequences.images import working_camera
-from bmask_slam.sequences.sequence import Sequence
 
 T = TypeVar("T")
 
@@ -99,49 +95,6 @@ class MeasuredSource:
     def use(self, camera: Camera) -> None:
         """Straighten the depth of later frames by another camera, from any thread."""
         self.camera = camera
-
-
-class RecordedSource:
-    """A recorded sequence, at the rate of its stamps if ``realtime``."""
-
-    pairs = interpolates = True
-
-    def __init__(self, sequence: Sequence, realtime: bool) -> None:
-        self.name, self.camera = sequence.name, sequence.camera
-        self.groundtruth = sequence.groundtruth
-        self.counts = SourceCounts(
-            unpaired_rgb=sequence.pairs.unpaired_rgb, unpaired_depth=sequence.pairs.unpaired_depth
-        )
-        self.waits = not realtime
-        self._sequence = sequence
-
-    def frames(self) -> Iterator[Frame]:
-        """Each frame, not before its time if ``realtime``."""
-        return self._frames() if self.waits else paced(self._frames())
-
-    def use(self, camera: Camera) -> None:
-        """Later frames have their depth at the colour image's time by this camera."""
-        self.camera = camera
-
-    def _frames(self) -> Iterator[Frame]:
-        """The frames, from the sequence with the camera that is used when each is read."""
-        sequence, start, last_s = self._sequence, 0, -np.inf
-        while start < len(sequence):
-            camera = sequence.camera
-            with closing(sequence.frames(start)) as frames:
-                for frame in frames:
-                    start, last_s = frame.index + 1, frame.timestamp_s
-                    self.counts.broken = len(sequence.skipped)
-                    yield frame
-                    if self.camera != camera:
-                        break
-                else:
-                    return
-            sequence = sequence.with_camera(self.camera)
-            start = int(np.searchsorted(sequence.timestamps_s, last_s, side="right"))
-
-    def close(self) -> None:
-        """Nothing to release: each frame opens and closes its own files."""
 
 
 class Wrapped:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, naming
 from bmask_slam.semantics.instances.image_files import decode_bytes
 from bmask_slam.sequences.images import Lens
 
@@ -141,9 +141,8 @@ def camera_of(
     k1, k2, p1, p2, k3 = [*(() if beyond else map(float, terms)), *[0.0] * 5][:5]
     fx, fy, cx, cy = map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     size, five = (int(info.width), int(info.height)), (k1, k2, p1, p2, k3)
-    camera = Camera(*size, fx, fy, cx, cy, five, depth_scale)
-    if fault := camera.fault():
-        raise InputError(f"{where}: a camera with {fault}; {cure}")
+    with naming(where, cure):
+        camera = Camera(*size, fx, fy, cx, cy, five, depth_scale)
     if not beyond:
         return camera, None
     lens = Lens(camera, tuple(map(float, terms)), fisheye)

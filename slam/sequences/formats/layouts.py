@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
+from bmask_slam.evaluation.recordings import is_joined
 from bmask_slam.evaluation.reference import TRUTH, read_reference
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError, did_you_mean
@@ -17,7 +18,7 @@ from bmask_slam.sequences.bags.bag_recording import open_bag_recording
 from bmask_slam.sequences.bags.topics import split_path
 from bmask_slam.sequences.cameras import find_camera
 from bmask_slam.sequences.formats.euroc import is_euroc, open_euroc
-from bmask_slam.sequences.formats.joined import is_joined, open_joined
+from bmask_slam.sequences.formats.joined import open_joined
 from bmask_slam.sequences.formats.numbered_folders import (
     is_icl_nuim,
     is_open3d,

@@ -12,7 +12,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, naming
 from bmask_slam.graph.files.reading import read_text
 from bmask_slam.graph.geometry import orthonormalised
 from bmask_slam.graph.trajectory import Trajectory
@@ -25,6 +25,7 @@ FPS_HZ = 30.0
 MAX_NUMBER_BYTES = 1 << 16
 _TOLERANCE = 0.02
 """Of the product of a rotation with its transpose."""
+CAMERA_CURE = "give --camera F"
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 """From a camera with x right, y down, z forward to one with y up and z backward (OpenGL, ARKit)."""
 
@@ -101,12 +102,5 @@ def trajectory_of(
 def camera_of_matrix(K: Array, size: tuple[int, int], depth_scale: float, where: str) -> Camera:
     """The camera of a calibration matrix (3, 3) and a size (width, height). Raises InputError."""
     fx, fy, cx, cy = (float(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    camera = Camera(*size, fx, fy, cx, cy, depth_scale=depth_scale)
-    return possible(camera, where)
-
-
-def possible(camera: Camera, where: str) -> Camera:
-    """The camera itself. Raises InputError for one that cannot be."""
-    if fault := camera.fault():
-        raise InputError(f"{where}: a camera with {fault}; give --camera F")
-    return camera
+    with naming(where, CAMERA_CURE):
+        return Camera(*size, fx, fy, cx, cy, depth_scale=depth_scale)

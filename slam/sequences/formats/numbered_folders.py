@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, naming
 from bmask_slam.graph.files.json_file import STRICT, read_json
 from bmask_slam.graph.files.reading import read_lines
 from bmask_slam.graph.geometry import inverse, make_pose
@@ -19,12 +19,12 @@ from bmask_slam.graph.trajectory import Trajectory, read_tum
 from bmask_slam.semantics.instances.image_files import decode_image
 from bmask_slam.sequences.cameras import recorded_camera
 from bmask_slam.sequences.formats.numbered import (
+    CAMERA_CURE,
     FPS_HZ,
     camera_of_matrix,
     image_list,
     matrix_of,
     numbered,
-    possible,
     read_matrix,
     trajectory_of,
 )
@@ -139,8 +139,9 @@ def open_replica(folder: Path, given: Given) -> Recording:
     for file in (folder / "cam_params.json", folder.resolve().parent / "cam_params.json"):
         if file.is_file():
             c = read_json(file, _ReplicaFile, "restore it, or give --camera F").camera
-            own = Camera(c.w, c.h, c.fx, c.fy, c.cx, c.cy, depth_scale=c.scale)
-            own, source = possible(own, str(file)), str(file)
+            with naming(str(file), CAMERA_CURE):
+                own = Camera(c.w, c.h, c.fx, c.fy, c.cx, c.cy, depth_scale=c.scale)
+            source = str(file)
             break
     camera, source = recorded_camera(own, source, folder, given)
     return Recording(

@@ -19,19 +19,19 @@ from pydantic import Field
 
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, naming
 from bmask_slam.graph.files.json_file import STRICT, parse_json, read_json
 from bmask_slam.graph.geometry import make_pose, rotation_from_quaternion
 from bmask_slam.semantics.instances.image_files import decode_colour, decode_image
 from bmask_slam.sequences.cameras import recorded_camera
 from bmask_slam.sequences.formats.lzfse import unpack_lzfse
 from bmask_slam.sequences.formats.numbered import (
+    CAMERA_CURE,
     FLIP_YZ,
     FPS_HZ,
     camera_of_matrix,
     image_list,
     numbered,
-    possible,
     trajectory_of,
 )
 from bmask_slam.sequences.lists import sorted_list
@@ -200,10 +200,9 @@ def open_polycam(folder: Path, given: Given) -> Recording:
     if not said:
         raise InputError(f"{cameras}: no cameras; {_CURE}")
     middle = sorted(said.values(), key=lambda camera: camera.fx)[len(said) // 2]
-    own = Camera(
-        middle.width, middle.height, middle.fx, middle.fy, middle.cx, middle.cy, depth_scale=1000.0
-    )
-    own = possible(own, str(cameras))
+    size, centre = (middle.width, middle.height), (middle.cx, middle.cy)
+    with naming(str(cameras), CAMERA_CURE):
+        own = Camera(*size, middle.fx, middle.fy, *centre, depth_scale=1000.0)
     camera, source = recorded_camera(own, str(cameras), folder, given)
     poses = [one.T_world_camera for one in said.values()]
     depth = numbered(depths, r"(\d{1,18})\.png")

@@ -86,6 +86,15 @@ def test_an_empty_graph_is_saved_too(tmp_path: Path) -> None:
     assert len(estimate.keyframe_ids) == 8
 
 
+def test_a_camera_that_cannot_be_is_refused_with_its_file(tmp_path: Path) -> None:
+    camera = replace(CAMERA)
+    object.__setattr__(camera, "fx", -500.0)
+    Smoother(camera).save(tmp_path / "graph")
+    words = r"graph: its camera: a focal length.* of -500, which is not positive.*save it again"
+    with pytest.raises(InputError, match=words):
+        read_graph(tmp_path / "graph")
+
+
 def test_the_depth_noise_of_the_camera_is_saved(tmp_path: Path) -> None:
     camera = replace(CAMERA, depth_noise=DepthNoise(0.001, 0.0, 0.002))
     Smoother(camera).save(tmp_path / "graph")

@@ -136,6 +136,13 @@ def test_a_factor_that_cannot_enter_is_refused() -> None:
             made.add_factor(factor)
 
 
+@pytest.mark.parametrize("given", ["x", "22 serialization::archive", 7, None])
+def test_what_is_no_factor_is_refused(given: object) -> None:
+    words = f"add_factor: a {type(given).__name__}; give a factor of GTSAM"
+    with pytest.raises(InputError, match=words):
+        system().add_factor(given)
+
+
 def spoilt(keyframe: int, fails: list[str]) -> gtsam.CustomFactor:
     """A factor of which the Jacobian is NaN, or which raises, once ``fails`` says so."""
 

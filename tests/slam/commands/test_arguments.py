@@ -6,7 +6,14 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from bmask_slam.commands.arguments import add_segmenter_arguments, segmenter_options
+import pytest
+
+from bmask_slam.commands.arguments import (
+    add_config_arguments,
+    add_segmenter_arguments,
+    chosen_config,
+    segmenter_options,
+)
 from bmask_slam.labelling.config import SemanticsConfig
 
 BASE = SemanticsConfig().segmenter
@@ -15,6 +22,7 @@ BASE = SemanticsConfig().segmenter
 def parsed(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     add_segmenter_arguments(parser, "light")
+    add_config_arguments(parser)
     return parser.parse_args(words)
 
 
@@ -26,3 +34,12 @@ def test_files_are_given_by_their_absolute_paths() -> None:
     found = segmenter_options(parsed("--proposals", "yolox.onnx"), replace(BASE, min_score=0.3))
     assert found.proposals == Path("yolox.onnx").absolute()
     assert found.min_score == 0.3
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--segmenter", BASE.name], ["--segmenter", "truth"], ["--labels", "coco"]],
+)
+def test_what_is_given_counts_as_given_where_it_is_the_default(words: list[str]) -> None:
+    assert not chosen_config(parsed(*words)).is_default
+    assert chosen_config(parsed()).is_default

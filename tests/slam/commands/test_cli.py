@@ -18,11 +18,13 @@ import bmask_slam.rendering.sequence
 from bmask_slam import cli
 from bmask_slam.commands import sequences
 from bmask_slam.config.configuration import resolve
+from bmask_slam.evaluation.recordings import JOINED, Part, write_parts
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.data_files import data_path
 from bmask_slam.graph.trajectory import write_tum
 from bmask_slam.offline.runner import RunSummary
 from bmask_slam.rendering.config import SCENES, RenderConfig
+from bmask_slam.run_folder.origin import Origin
 from bmask_slam.runtime.progress import console_log
 from bmask_slam.system_config import SystemConfig
 
@@ -230,10 +232,38 @@ def test_evaluate_table_json_and_plot(capsys, sequence: Path, tmp_path: Path) ->
     assert re.search(r"^ate_rmse +0\.0299 m$", call(capsys, *command)[1], re.MULTILINE)
 
 
+def test_no_scale_of_an_estimate_that_does_not_move(capsys, sequence: Path, tmp_path: Path) -> None:
+    still = true_trajectory(20)
+    still.poses_world_camera[:, :3, 3] = 1.0, 2.0, 3.0
+    write_tum(tmp_path / "still.txt", still)
+    command = ("evaluate", tmp_path / "still.txt", "--reference", sequence)
+    assert call(capsys, *command)[0] == 0
+    status, output, errors = call(capsys, *command, "--with-scale")
+    assert (status, output, errors.count("\n")) == (1, "", 1)
+    assert f"{tmp_path / 'still.txt'} against" in errors
+    assert "does not move" in errors and "omit --with-scale" in errors
+
+
 def test_info(capsys, sequence: Path) -> None:
     status, output, _ = call(capsys, "info", sequence)
     assert status == 0
     assert re.search(r"^frames +20 in 1.90 s, 10.00 Hz$", output, re.MULTILINE)
+
+
+def test_info_of_a_run_is_that_of_its_recordings(capsys, sequence: Path, tmp_path: Path) -> None:
+    merged, alone = tmp_path / "merged", tmp_path / "alone"
+    for run in (merged, alone):
+        run.mkdir()
+        (run / "config.yaml").write_text(f"# {Origin(sequence)}\n")
+    parts = [
+        Part(sequence=str(sequence), begin_s=0.0, end_s=1.9, shift_s=shift_s)
+        for shift_s in (0.0, 12.0)
+    ]
+    write_parts(merged / JOINED, parts)
+    status, output, _ = call(capsys, "info", merged)
+    assert status == 0
+    assert re.search(r"^frames +40 in 13.90 s, 10.00 Hz$", output, re.MULTILINE)
+    assert call(capsys, "info", alone) == call(capsys, "info", sequence)
 
 
 def test_render_help_names_every_scene(capsys) -> None:

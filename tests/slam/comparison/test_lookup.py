@@ -17,13 +17,18 @@ from bmask_slam.comparison.experiment.experiment import (
 from bmask_slam.comparison.experiment.options import (
     CompareOptions,
     parse_trajectory,
+    select_part,
     with_trajectories,
 )
 from bmask_slam.comparison.experiment.result import CellStatus
 from bmask_slam.comparison.jobs.bar import JobBar
 from bmask_slam.comparison.jobs.cells import CellKey, rendered_sequence, run_jobs
 from bmask_slam.comparison.jobs.errors import Rules, trajectory_errors
-from bmask_slam.comparison.jobs.external import published_cells
+from bmask_slam.comparison.jobs.external import (
+    other_methods,
+    published_cells,
+    trajectory_cells,
+)
 from bmask_slam.comparison.jobs.job import Job, Outcome
 from bmask_slam.comparison.jobs.plan import make_plan
 from bmask_slam.graph.errors import InputError
@@ -192,6 +197,45 @@ def test_sim3_only_on_request(tmp_path):
     files = tmp_path / "estimate.txt", tmp_path / "truth.txt"
     assert trajectory_errors(*files, Rules(0.02))["ate_rmse"] > 0.1
     assert trajectory_errors(*files, Rules(0.02, True))["ate_rmse"] == pytest.approx(0, abs=1e-6)
+
+
+def cell_of_other(folder: Path, estimate: Trajectory, truth: Trajectory, **changes: object):
+    """The cell and the row of another system, whose trajectory is given by --trajectory."""
+    write_tum(folder / "estimate.txt", estimate)
+    write_tum(folder / "truth.txt", truth)
+    options = CompareOptions(
+        references={"xyz": folder / "truth.txt"},
+        trajectories={("ORB", "xyz"): folder / "estimate.txt"},
+        **changes,
+    )
+    part = select_part(experiment(folder), options)
+    plan = make_plan(part, folder, options)
+    (cell,), (row,) = trajectory_cells(part, plan.sequence, plan.files), other_methods(part)
+    return cell, row
+
+
+def half_as_large(count: int = 50) -> tuple[Trajectory, Trajectory]:
+    """A trajectory of half the size, and the true one."""
+    stamps = np.arange(count) / 10
+    truth = Trajectory(stamps, se3_exp(np.random.default_rng(0).normal(0, 1, (count, 6))))
+    half = truth.poses_world_camera.copy()
+    half[:, :3, 3] /= 2
+    return Trajectory(stamps, half), truth
+
+
+def test_with_scale_is_of_the_trajectories_of_other_systems_too(tmp_path):
+    cell, row = cell_of_other(tmp_path, *half_as_large())
+    assert cell.metrics["ate_rmse"] > 0.1 and not row.with_scale
+    cell, row = cell_of_other(tmp_path, *half_as_large(), with_scale=True)
+    assert cell.metrics["ate_rmse"] == pytest.approx(0, abs=1e-6) and row.with_scale
+
+
+def test_no_scale_of_an_estimate_that_does_not_move_is_a_failed_cell(tmp_path):
+    truth = half_as_large()[1]
+    still = Trajectory(truth.timestamps_s, np.tile(np.eye(4), (50, 1, 1)))
+    cell, _ = cell_of_other(tmp_path, still, truth, with_scale=True)
+    assert cell.status is CellStatus.FAILED
+    assert "does not move" in cell.error and "omit --with-scale" in cell.error
 
 
 def test_the_remaining_time_is_estimated_from_the_same_group():

@@ -10,6 +10,8 @@ from repository import SHARED
 
 from bmask_slam.evaluation import evaluate, evaluate_trajectory, format_json, format_table
 from bmask_slam.evaluation.plot import plot_trajectory, view_plane
+from bmask_slam.evaluation.recordings import JOINED, Part, merged_clock, write_parts
+from bmask_slam.events import read_events
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import make_pose, se3_exp, so3_exp
 from bmask_slam.graph.trajectory import Trajectory, write_tum
@@ -94,6 +96,12 @@ def test_scale_only_on_request():
     assert evaluate_trajectory(estimate, reference).value("ate_rmse") > 0.1
     scaled = evaluate_trajectory(estimate, reference, with_scale=True)
     assert scaled.value("ate_rmse") < 1e-9
+
+
+def test_a_scale_of_an_estimate_that_does_not_move_is_refused():
+    still = Trajectory(arc().timestamps_s, np.tile(np.eye(4), (300, 1, 1)))
+    with pytest.raises(InputError, match=r"does not move.*omit --with-scale"):
+        evaluate_trajectory(still, arc(), with_scale=True)
 
 
 def test_metrics_without_a_value_have_no_row(caplog):
@@ -228,3 +236,46 @@ def test_a_reference_of_another_body(tmp_path: Path):
     assert found.value("body_angle") == pytest.approx(np.rad2deg(1.5), abs=0.3)
     with pytest.raises(InputError, match="--hand-eye with --with-scale"):
         evaluate(*both, with_scale=True, with_body=True)
+
+
+def merged_run(folder: Path, spans: list[tuple[int, int, float]]) -> Path:
+    """A merged run of parts of an arc: first and last pose of each, and the shift of its stamps."""
+    folder.mkdir()
+    stamps_s, poses = arc().timestamps_s, shaken(arc()).poses_world_camera
+    parts = [
+        Part(sequence="s", begin_s=stamps_s[a], end_s=stamps_s[b], shift_s=shift_s)
+        for a, b, shift_s in spans
+    ]
+    write_parts(folder / JOINED, parts)
+    moved_s = [stamps_s[a : b + 1] + shift_s for a, b, shift_s in spans]
+    joined = np.concatenate([poses[a : b + 1] for a, b, _ in spans])
+    write_tum(folder / "trajectory.txt", Trajectory(np.concatenate(moved_s), joined))
+    return folder
+
+
+def test_a_merged_run_is_evaluated_by_the_stamps_of_its_recordings(tmp_path, caplog):
+    """Its second recording is the earlier one, and was moved to after the first."""
+    write_tum(tmp_path / "truth.txt", arc())
+    run = merged_run(tmp_path / "run", [(150, 299, 0.0), (0, 149, 20.0)])
+    lost = f"5,{arc().timestamps_s[5] + 20:.6f},lost,why\n"
+    (run / "events.csv").write_text("index,timestamp,kind,text\n" + lost)
+    (run / "frames.csv").write_text("index,timestamp\n" + "0,0\n" * 300)
+    found = evaluate(run, tmp_path / "truth.txt", tmp_path / "plot.svg")
+    assert found.value("associated_poses") == 300
+    assert found.value("ate_rmse") == pytest.approx(0.0173, abs=0.001)
+    assert "overlap" not in caplog.text
+    (event,) = merged_clock(run).own_events(read_events(run))
+    assert event.timestamp_s == pytest.approx(arc().timestamps_s[5], abs=1e-6)
+
+
+def test_recordings_that_overlap_keep_their_moved_stamps_with_a_warning(tmp_path, caplog):
+    write_tum(tmp_path / "truth.txt", arc())
+    run = merged_run(tmp_path / "run", [(0, 199, 0.0), (100, 299, 20.0)])
+    assert evaluate(run, tmp_path / "truth.txt").value("associated_poses") == 200
+    (warning,) = [r.getMessage() for r in caplog.records if "overlap" in r.getMessage()]
+    assert f"{run / 'trajectory.txt'}: " in warning and "trajectory_run_N.txt" in warning
+    caplog.clear()
+    evaluate(
+        merged_run(tmp_path / "unmoved", [(0, 99, 0.0), (150, 299, 0.0)]), tmp_path / "truth.txt"
+    )
+    assert "overlap" not in caplog.text

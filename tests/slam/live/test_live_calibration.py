@@ -32,7 +32,7 @@ from bmask_slam.live.play import PlayOptions, play
 from bmask_slam.live.processes import remote_calibration
 from bmask_slam.live.processes.calibration_process import CalibrationSetup
 from bmask_slam.live.sources.bag_source import BagSource
-from bmask_slam.live.sources.source import RecordedSource
+from bmask_slam.live.sources.recorded_source import RecordedSource
 from bmask_slam.live.start import LiveOptions
 from bmask_slam.run_folder.map_file import read_map, read_run
 from bmask_slam.run_folder.reader import Run

@@ -87,6 +87,14 @@ def test_live_is_as_good_as_offline_and_leaves_the_same_files(tmp_path, offline)
     assert {"latency_ms_median", "frames_dropped", "isam2_update_ms_median"} <= names
 
 
+def test_frames_after_the_end_are_refused_in_one_line(caplog) -> None:
+    with LiveSlam(CAMERA, CONFIG) as slam:
+        pass
+    with pytest.raises(InputError, match="track: this LiveSlam is closed; track frames in its"):
+        track_frames(slam, FRAMES[2:3])
+    assert not caplog.records
+
+
 def test_a_killed_map_process_is_restarted_without_losing_frames(tmp_path) -> None:
     with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
         track_frames(slam, FRAMES[:12])

@@ -23,7 +23,7 @@ from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.merging.joining import join_objects
 from bmask_slam.merging.merge import MergeOptions, merge_runs
-from bmask_slam.merging.report import MergeSummary
+from bmask_slam.merging.report import MergeSummary, format_merge
 from bmask_slam.run_folder import metrics
 from bmask_slam.run_folder.folder import RunFolder
 from bmask_slam.run_folder.map_file import read_map, write_map
@@ -213,3 +213,9 @@ def test_recordings_are_listed_where_they_are_known(merged: MergeSummary) -> Non
     assert not (merged.folder / "recordings.json").exists()  # these runs were live
     assert "live" in (merged.folder / "config.yaml").read_text().splitlines()[0]
     assert json.loads((merged.folder / "metrics.json").read_text())
+
+
+def test_a_run_whose_stamps_are_moved_is_said(merged: MergeSummary) -> None:
+    (line,) = (line for line in merged.lines if "stamps" in line)
+    assert line.startswith("second: +11 s to its stamps in trajectory.txt")
+    assert line in format_merge(merged).splitlines()

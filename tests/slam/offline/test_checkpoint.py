@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 from fake_run import FakeSystem, make_sequence, signal_at
 
+from bmask_slam.cli import main
+from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import plot
 from bmask_slam.events import EventKind, read_events
 from bmask_slam.graph.errors import InputError
@@ -201,6 +203,24 @@ def test_another_sequence_is_refused(begun: Path, sequence: Path, refused) -> No
     refused(r"seq: not the camera that the run was started with")
     shutil.rmtree(sequence)
     refused(r"seq: no such folder")
+
+
+def test_what_the_run_was_started_without_is_said_in_words(begun: Path, refused) -> None:
+    said = "the run was started without"
+    refused(f"--max-frames: {said} --max-frames; omit it", {"max_frames": 100})
+    refused(f"--map: {said} --map; omit it", {"dense": True})
+    refused(f"--mesh-voxel: {said} --mesh-voxel; omit it", {"mesh_voxel_m": 0.03})
+
+
+@pytest.mark.parametrize("segmenter", [SystemConfig().semantics.segmenter.name, "truth"])
+def test_another_segmenter_is_refused_also_the_default(
+    sequence: Path, tmp_path: Path, capsys, segmenter: str
+) -> None:
+    config = resolve(SystemConfig, None, ["semantics.segmenter.name=precomputed"])
+    stopped = partial(FakeSystem, on_frame=signal_at(9, signal.SIGINT))
+    out = run(options(sequence, tmp_path / "out", config=config), stopped).folder
+    assert main(["run", "--resume", str(out), "--segmenter", segmenter]) == 1
+    assert "--config: the run was started with another conf" in capsys.readouterr().err
 
 
 def test_other_options_are_refused(begun: Path, refused) -> None:

@@ -194,6 +194,11 @@ def test_localisation_excludes_options_that_extend_the_map(other: str, flag: str
         RunOptions(Path("x"), localise=Path("m"), **{other: 7})
 
 
+def test_a_map_that_is_only_searched_has_no_covariances() -> None:
+    with pytest.raises(InputError, match=r"--localise m: does not .*, which --covariances needs"):
+        RunOptions(Path("x"), SystemConfig(covariances=True), localise=Path("m"))
+
+
 def cut_out(folder: Path, frames: range, margin_px: int = 0) -> Path:
     """Some frames of the kitchen as a sequence with smaller images."""
     inside = slice(margin_px, -margin_px or None)

@@ -14,7 +14,10 @@ import numpy as np
 import pytest
 from fake_run import FakeSystem, make_sequence
 
+from bmask_slam.evaluation import evaluate
+from bmask_slam.evaluation.recordings import JOINED, Part, write_parts
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
 from bmask_slam.offline import runner
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.reporting.run_report import write_run_report
@@ -125,3 +128,46 @@ def test_no_run_and_no_folder_are_refused(run: Path, tmp_path: Path) -> None:
         write_run_report(run, tmp_path)
     with pytest.raises(InputError, match="no such folder for the report"):
         write_run_report(run, tmp_path / "missing" / "page.html")
+
+
+def test_all_errors_are_against_the_given_reference(run: Path, tmp_path: Path) -> None:
+    """The run's is exact; beside one that swings by 5 cm its ATE is 5 cm in every place."""
+    truth = read_tum(run.parent / "seq" / "groundtruth.txt")
+    poses = truth.poses_world_camera.copy()
+    poses[:, 2, 3] += 0.05 * (-1.0) ** np.arange(len(poses))
+    write_tum(tmp_path / "swinging.txt", Trajectory(truth.timestamps_s, poses))
+    plain = Page(write_run_report(run, tmp_path / "plain.html"))
+    assert "ATE 0.00 cm" in plain.text
+    page = Page(write_run_report(run, tmp_path / "given.html", tmp_path / "swinging.txt"))
+    (ate_cm,) = re.findall(r"ATE ([0-9.]+) cm", page.text)
+    (drawn_mm,) = re.findall(r"ATE ([0-9.]+) mm", page.text)
+    (listed_m,) = re.findall(r"([0-9.]+) m +ate_rmse", page.text)
+    assert float(ate_cm) == pytest.approx(4.9, abs=0.2)
+    assert float(drawn_mm) == pytest.approx(10 * float(ate_cm), abs=0.1)
+    assert float(listed_m) == pytest.approx(float(ate_cm) / 100, abs=1e-4)
+    assert f"errors against {tmp_path / 'swinging.txt'}" in page.text
+
+
+def test_a_reference_of_other_times_is_refused_as_by_evaluate(run: Path, tmp_path: Path) -> None:
+    truth = read_tum(run.parent / "seq" / "groundtruth.txt")
+    late = Trajectory(truth.timestamps_s + 1000, truth.poses_world_camera)
+    write_tum(tmp_path / "late.txt", late)
+    with pytest.raises(InputError) as of_evaluate:
+        evaluate(run, tmp_path / "late.txt")
+    with pytest.raises(InputError) as of_report:
+        write_run_report(run, tmp_path / "page.html", tmp_path / "late.txt")
+    assert str(of_report.value) == str(of_evaluate.value)
+    assert "0 of 18 poses have a reference pose" in str(of_report.value)
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_merged_run_is_beside_a_given_reference_by_its_own_stamps(run: Path, tmp_path) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    poses = read_tum(run / "trajectory.txt")
+    write_tum(
+        copy / "trajectory.txt", Trajectory(poses.timestamps_s + 30, poses.poses_world_camera)
+    )
+    write_parts(copy / JOINED, [Part(sequence="s", begin_s=0.0, end_s=1.9, shift_s=30.0)])
+    reference = run.parent / "seq" / "groundtruth.txt"
+    page = Page(write_run_report(copy, tmp_path / "page.html", reference))
+    assert "ATE 0.00 cm" in page.text and "over 18 poses" in page.text

@@ -72,6 +72,8 @@ def test_the_example_in_the_messages_is_valid(tmp_path):
         ({"depth_scale": None}, "depth_scale is missing"),
         ({"fx": "-527"}, "fx is -527; it must be positive"),
         ({"fy": "0"}, "fy is 0; it must be positive"),
+        ({"fx": "1.0e-12"}, r"camera\.yaml: a focal length.* 1e-12, which is not positive"),
+        ({"fx": "1.0e+200"}, r"camera\.yaml: a camera with a number that is not finite"),
         ({"depth_scale": "0"}, "depth_scale is 0"),
         ({"stereo_bf": "-1"}, "stereo_bf is -1"),
         ({"width": "640.5"}, "width is 640.5; it must be a whole number"),

@@ -1,6 +1,7 @@
 """Sequences in TUM layout: frames, their order, and the reading thread."""
 
 import dataclasses
+import json
 import re
 import threading
 import time
@@ -11,7 +12,7 @@ import pytest
 from repository import KITCHEN
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.sequences.info import format_info, sequence_info
+from bmask_slam.sequences.info import format_info, info_as_json, sequence_info
 from bmask_slam.sequences.prefetch import prefetched
 from bmask_slam.sequences.recording import Recording
 from bmask_slam.sequences.sequence import open_sequence
@@ -189,6 +190,20 @@ def test_info(folder):
     text = format_info(info)
     for words in ("8 in 1.10 s, 10.00 Hz", "32x24", "camera.yaml", "1000 to the metre", "37.5 %"):
         assert words in text
+
+
+def test_what_one_frame_does_not_tell_is_unknown(folder):
+    for name in ("rgb.txt", "depth.txt"):
+        (folder / name).write_text((folder / name).read_text().splitlines()[-1])
+    info = sequence_info(open_sequence(folder))
+    assert (info.frames, info.gaps) == (1, ())
+
+    def not_json(word: str) -> None:
+        pytest.fail(f"{word} is not JSON")
+
+    found = json.loads(info_as_json(info), parse_constant=not_json)
+    assert found["fps_hz"] is None and found["camera"]["fx"] == info.camera.fx
+    assert re.search(r"^frames +1 in 0.00 s, unknown Hz$", format_info(info), re.MULTILINE)
 
 
 @pytest.mark.skipif(not KITCHEN.is_dir(), reason="no ../shared/data/redkitchen here")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +23,8 @@ from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.growing_folder import GrowingFolder
 from bmask_slam.live.sources.opening import SourceOptions, open_source
-from bmask_slam.live.sources.source import RecordedSource, Source
+from bmask_slam.live.sources.recorded_source import RecordedSource
+from bmask_slam.live.sources.source import Source
 from bmask_slam.sequences.bags.topics import BagTopics
 from bmask_slam.sequences.cameras import write_camera
 from bmask_slam.sequences.sequence import Sequence, open_sequence
@@ -116,6 +118,18 @@ def test_numbers_out_of_range_are_refused(name: str, value: float) -> None:
         InputError, match=f"--{name.removesuffix('_s').replace('_', '-')} {value:g}"
     ):
         SourceOptions(**{name: value})
+
+
+def test_gaps_of_a_recording_are_counted(recording: Sequence, tmp_path: Path) -> None:
+    whole, path = source_of(recording.folder), tmp_path / "seq"
+    assert len(list(whole.frames())) == FRAMES and whole.counts.gaps == 0
+    shutil.copytree(recording.folder, path)
+    for name in ("rgb.txt", "depth.txt"):  # a step of four after frame 2
+        lines = (path / name).read_text().splitlines(keepends=True)
+        (path / name).write_text("".join(lines[:3] + lines[6:]))
+    source = source_of(path)
+    assert len(list(source.frames())) == FRAMES - 3
+    assert source.counts.line() == "1 gaps"
 
 
 def test_live_on_a_bag(recording: Sequence, bag: Path, tmp_path: Path, capsys) -> None:

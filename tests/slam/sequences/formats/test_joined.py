@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from fake_run import make_sequence
 
+from bmask_slam.evaluation.recordings import JOINED, Part, read_parts, write_parts
 from bmask_slam.graph.errors import InputError
-from bmask_slam.sequences.formats.joined import JOINED, Part, read_parts, write_parts
 from bmask_slam.sequences.sequence import open_sequence
 
 
