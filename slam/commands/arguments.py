@@ -26,7 +26,6 @@ DETAILS = (
 )
 """Figures of metrics.json that are not printed; nor are those of the graph."""
 SEGMENTERS = "light, mask-scoring-rcnn, precomputed, truth, none, or module:Class of your own"
-
 SEGMENTER_OPTIONS = ("segmenter", "weights", "proposals", "masks", "ray", "labels")
 
 

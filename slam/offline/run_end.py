@@ -109,7 +109,7 @@ def _camera_checked(run: ActiveRun) -> CameraCheck:
     try:
         if unit := depth_warning(run.sequence):
             logger.warning("camera: %s", unit)
-            return CameraCheck((unit,), (), ())
+            return CameraCheck((unit,), (), (row("camera_warnings", 1, "1"),))
         checked = check_camera(run.system.as_run(), run.sequence)
     except InputError as error:
         logger.info("camera not checked: %s", error)

@@ -203,7 +203,10 @@ def is_open3d(folder: Path) -> bool:
 
 
 def open_open3d(folder: Path, given: Given) -> Recording:
-    """Depth is registered by Open3D already; matrices are by columns. Raises InputError."""
+    """Depth is registered by Open3D already; matrices are by columns. Raises InputError.
+
+    Stamps are numbers over the camera's rate.
+    """
     colour = numbered(folder / "color", rf"{_DIGITS}\.(?:jpg|png)")
     depth = numbered(folder / "depth", rf"{_DIGITS}\.png")
     path = _open3d_intrinsics(folder)
@@ -212,6 +215,6 @@ def open_open3d(folder: Path, given: Given) -> Recording:
     own = camera_of_matrix(K, (said.width, said.height), said.depth_scale, str(path))
     camera, source = recorded_camera(own, str(path), folder, given)
     return Recording(
-        "Open3D", folder, image_list(colour, FPS_HZ, folder, "colour"),
-        image_list(depth, FPS_HZ, folder, "depth"), camera, source,
+        "Open3D", folder, image_list(colour, camera.fps, folder, "colour"),
+        image_list(depth, camera.fps, folder, "depth"), camera, source,
     )  # fmt: skip

@@ -7,6 +7,7 @@ import logging
 import struct
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ from bmask_slam.graph.geometry import (
     rotation_from_quaternion,
     se3_exp,
 )
+from bmask_slam.sequences.cameras import write_camera
 from bmask_slam.sequences.formats import euroc
 from bmask_slam.sequences.formats.convert import convert
 from bmask_slam.sequences.formats.lzfse import unpack_lzfse
@@ -146,6 +148,14 @@ def test_other_associations_are_no_list_of_tum(tmp_path: Path) -> None:
     folder = write_small(SMALL_LAYOUTS[7], tmp_path)
     (folder / "associations.txt").write_text("0 0\n1 1\n")
     assert open_sequence(folder).recording.layout == "Open3D"
+
+
+def test_the_rate_of_open3ds_images_is_that_of_the_camera(tmp_path: Path) -> None:
+    folder = write_small(SMALL_LAYOUTS[7], tmp_path)
+    before = open_sequence(folder)
+    write_camera(folder / "camera.yaml", replace(before.camera, fps=15.0))
+    slower = open_sequence(folder)
+    np.testing.assert_allclose(slower.timestamps_s, 2 * before.timestamps_s)
 
 
 def test_truth_of_markers_is_moved_to_the_camera(tmp_path: Path) -> None:
