@@ -12,6 +12,7 @@ from bmask_slam.calibration.motion import landmark_motion
 from bmask_slam.calibration.priors import CalibrationPriors
 from bmask_slam.calibration.report import Calibrated, format_calibration, parameters_named
 from bmask_slam.calibration.views import SequenceDepths, connected_views, make_views
+from bmask_slam.evaluation.ate_rpe import clock_of
 from bmask_slam.evaluation.reference import read_reference
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.calibration.calibration import CalibrationResult, calibrate
@@ -169,7 +170,8 @@ def make_problem(
     stamps = np.array([stamps_s[k] for k in keyframe_ids.tolist()])
     positions, gauge = np.full((len(poses), 3), np.nan), GAUGE_SIGMAS
     if options.reference is not None:
-        positions, T_reference_world = _reference_positions(options.reference, stamps, poses)
+        own_s = clock_of(run.path / "trajectory.txt").own_s(stamps)
+        positions, T_reference_world = _reference_positions(options.reference, own_s, poses)
         poses, points = T_reference_world @ poses, transform(T_reference_world, points)
         gauge = FREE_SIGMAS
     sigma_m = options.anchor_sigma_m

@@ -138,7 +138,7 @@ def evaluate(
         raise InputError("--hand-eye with --with-scale: a body's place needs metres; leave one out")
     run_or_trajectory, truth_file = Path(run_or_trajectory), reference_file(Path(reference))
     file = file_in(run_or_trajectory, "trajectory.txt", "a run folder or a trajectory file")
-    frames_s, clock = frame_stamps(file), _clock_of(file)
+    frames_s, clock = frame_stamps(file), clock_of(file)
     stamps_s = read_times(times) if times else frames_s
     frames = 0 if frames_s is None else len(frames_s)
     estimate = clock.own_trajectory(read_trajectory(file, stamps_s))
@@ -163,7 +163,7 @@ def _of_body(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, list[
     return body_trajectory(estimate, T_camera_body), _body_rows(T_camera_body)
 
 
-def _clock_of(file: Path) -> MergedClock:
+def clock_of(file: Path) -> MergedClock:
     """The clock of the run of a trajectory.txt; warns where moved stamps stay as they are."""
     clock = merged_clock(file.parent) if file.name == "trajectory.txt" else MergedClock()
     if clock.overlapping:

@@ -16,7 +16,9 @@ from bmask_slam.evaluation import (
     frame_stamps,
     read_reference,
 )
+from bmask_slam.evaluation.ate_rpe import clock_of
 from bmask_slam.evaluation.plot import plot_trajectory
+from bmask_slam.evaluation.recordings import JOINED
 from bmask_slam.events import EVENTS, read_events
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment, AdjustmentConfig, Stage, adjust
@@ -117,7 +119,11 @@ def adjust_run(
         trajectory = _write_run(run, before, adjustment, folder, saved)
         given, errors = run.trajectories["trajectory.txt"], None
         if truth is not None:
-            errors = (evaluate_trajectory(given, truth), evaluate_trajectory(trajectory, truth))
+            own = clock_of(path / "trajectory.txt").own_trajectory
+            errors = (
+                evaluate_trajectory(own(given), truth),
+                evaluate_trajectory(own(trajectory), truth),
+            )
         done = adjustment, frames, GraphSnapshot.of(run.tables), errors
         result = RunAdjustment(folder.path, *done, plot or out / PICTURE)
         folder.write_text("metrics.json", format_json(result_rows(result)))
@@ -170,7 +176,7 @@ def _write_run(
     }
     for name, trajectory in moved.items():
         folder.write_trajectory(trajectory, name)
-    for name in (FRAMES, EVENTS, "config.yaml"):
+    for name in (FRAMES, EVENTS, "config.yaml", JOINED):
         if (run.path / name).is_file():
             with whole_file(folder.path / name) as temporary:
                 shutil.copyfile(run.path / name, temporary)

@@ -119,6 +119,23 @@ def test_an_adjusted_run_folder_is_more_accurate(capsys, kitchen: Path, tmp_path
     assert cli.main(["evaluate", str(out), "--reference", str(KITCHEN)]) == 0
 
 
+def test_a_merged_run_is_compared_by_the_stamps_of_its_recordings(
+    kitchen: Path, tmp_path: Path
+) -> None:
+    """As if merging had added 50 s."""
+    run = shutil.copytree(kitchen, tmp_path / "run")
+    stamps_s = read_tum(run / "trajectory.txt").timestamps_s
+    part = {"sequence": "s", "begin_s": stamps_s[0] - 50, "end_s": stamps_s[-1] - 50}
+    (run / "recordings.json").write_text(json.dumps({"recordings": [part | {"shift_s": 50.0}]}))
+    truth = read_tum(KITCHEN / "groundtruth.txt")
+    earlier = Trajectory(truth.timestamps_s - 50, truth.poses_world_camera)
+    write_tum(tmp_path / "truth.txt", earlier)
+    out = tmp_path / "out"
+    assert optimise(run, "--out", out, "--reference", tmp_path / "truth.txt") == 0
+    assert value(out, "ate_rmse") < 1.05 * value(kitchen, "ate_rmse")
+    assert (out / "recordings.json").read_text() == (run / "recordings.json").read_text()
+
+
 def from_keyframes(run: Path) -> Array:
     """The smoothed poses of the keyframes' frames (K, 4, 4), in the keyframes."""
     frames, keyframes = (read_tum(run / f"{name}.txt") for name in ("trajectory", "keyframes"))
