@@ -117,13 +117,8 @@ def adjust_run(
         saved = read_map(path) if (path / MAP).is_file() else None
         frames = _with_frames(run, saved[0]) if saved else None
         trajectory = _write_run(run, before, adjustment, folder, saved)
-        given, errors = run.trajectories["trajectory.txt"], None
-        if truth is not None:
-            own = clock_of(path / "trajectory.txt").own_trajectory
-            errors = (
-                evaluate_trajectory(own(given), truth),
-                evaluate_trajectory(own(trajectory), truth),
-            )
+        pair = run.trajectories["trajectory.txt"], trajectory
+        errors = None if truth is None else _errors(path, pair, truth)
         done = adjustment, frames, GraphSnapshot.of(run.tables), errors
         result = RunAdjustment(folder.path, *done, plot or out / PICTURE)
         folder.write_text("metrics.json", format_json(result_rows(result)))
@@ -131,6 +126,15 @@ def adjust_run(
         plot_trajectory(picture, trajectory, truth, folder.path.name, read_events(path))
         draw_adjustment(result.picture, before, result.graph, adjustment)
         return result
+
+
+def _errors(
+    path: Path, pair: tuple[Trajectory, Trajectory], truth: Trajectory
+) -> tuple[EvaluationResult, EvaluationResult]:
+    """The errors of a run's trajectory before and after, by the stamps of its recordings."""
+    clock = clock_of(path / "trajectory.txt")
+    before, after = (evaluate_trajectory(clock.own_trajectory(t), truth) for t in pair)
+    return before, after
 
 
 def _with_frames(run: SavedRun, state: Arrays) -> Stage | None:
