@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample, interpolate
+from torch.nn.functional import avg_pool2d, grid_sample
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
@@ -115,11 +115,17 @@ def _shrunk(image: Tensor, by: int) -> Tensor:
 
 
 def _enlarged(small: InverseDepthMap, shape: Sequence[int]) -> InverseDepthMap:
-    """A map of a larger shape (H, W) in which every pixel has the estimate of its block."""
-    rho, variance = (
-        interpolate(x[None, None], size=tuple(shape), mode="nearest-exact")[0, 0]
-        for x in (small.rho, small.variance)
+    """A map of a larger shape (H, W) in which every pixel has the estimate of its block.
+
+    What is left beyond the last whole block has that of the last one.
+    """
+    rows, columns = (
+        torch.arange(whole, device=small.rho.device)
+        .div(whole // kept, rounding_mode="floor")
+        .clamp(max=kept - 1)
+        for whole, kept in zip(shape, small.rho.shape, strict=True)
     )
+    rho, variance = (x[rows][:, columns] for x in (small.rho, small.variance))
     return InverseDepthMap(rho, variance)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
+from bmask_slam.graph.arrays import Array, Floats, Ints, Mask, step_of
 from bmask_slam.semantics.beliefs.pixel_assignment import NO_INSTANCE, PixelAssignment, are_within
 from bmask_slam.semantics.beliefs.vote_config import VoteConfig
 
@@ -147,8 +147,8 @@ def _at_edges(
         the only one (N,).
     """
     size, depth_size = stack.owner.shape[1:], stack.depth_m.shape[1:]
-    step = max(size[0] // max(depth_size[0], 1), 1)
-    limits = np.minimum(depth_size, np.array(size) // step) - 1
+    step = step_of(size[0], depth_size[0])
+    limits = np.minimum(depth_size, -(-np.array(size) // step)) - 1
     reach = np.arange(-(config.edge_px // step), config.edge_px // step + 1)
     shifts = np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
     around = np.stack([rows, columns], axis=1)[:, None] // step + shifts

@@ -6,14 +6,15 @@ Masks are decoded one at a time.
 from __future__ import annotations
 
 import logging
-from collections import defaultdict
+from collections import Counter, defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from pycocotools import mask as coco_mask
-from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, Field, TypeAdapter, ValidationError
 
 from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.errors import InputError
@@ -37,7 +38,8 @@ MAX_MASK_BYTES = 1 << 30
 """Of the masks of one image, decoded, a byte a pixel."""
 Id = Annotated[int, Field(ge=-(2**53), le=2**53)]
 Side = Annotated[int, Field(ge=1, le=MAX_SIDE)]
-Probability = Annotated[float, Field(ge=0, le=1 + 1e-6)]
+Probability = Annotated[float, Field(ge=0, le=1 + 1e-6), AfterValidator(lambda p: min(p, 1.0))]
+"""A probability that rounding may have put a little above 1."""
 
 
 class _Category(BaseModel):
@@ -145,6 +147,7 @@ def read_coco(path: Path) -> CocoFile:
     """
     content = read_json(path, _File, CURE)
     images = _checked_images(content.images, path)
+    _check_unique([c.id for c in content.categories], f"{path}: category id")
     categories = sorted((c.id, c.name) for c in content.categories)
     labels = {number: k for k, (number, _) in enumerate(categories, 1)}
     objects: dict[int, list[CocoObject]] = defaultdict(list)
@@ -176,6 +179,8 @@ def _checked_images(listed: list[_Image], path: Path) -> dict[int, _Image]:
     """The images by id. Raises InputError."""
     if not listed:
         raise InputError(f"{path}: there is no image in it; give another file")
+    _check_unique([image.id for image in listed], f"{path}: image id")
+    _check_unique([image.file_name for image in listed], f"{path}: image")
     for image in listed:
         check_name(image.file_name, f"{path}: image {image.id}")
         if image.height * image.width > MAX_PIXELS:
@@ -184,6 +189,13 @@ def _checked_images(listed: list[_Image], path: Path) -> dict[int, _Image]:
                 f"{MAX_PIXELS // 10**6} megapixels; correct its size"
             )
     return {image.id: image for image in listed}
+
+
+def _check_unique(values: Sequence[int | str], what: str) -> None:
+    """Raise InputError for a value that stands twice, as in files that were joined."""
+    value, count = max(Counter(values).items(), key=lambda item: item[1], default=("", 1))
+    if count > 1:
+        raise InputError(f"{what} {value} stands {count} times; give each one of its own")
 
 
 def _check_room(present: int, image: _Image) -> None:

@@ -81,16 +81,28 @@ def seen_again(points: Array, views: Ints, reach_m: float) -> Mask:
     """Which of the points (N, 3) of one object other views than their own (N,) show as well.
 
     That is within ``reach_m`` or, where points are sparse, within three times the median distance
-    to the nearest point of another view, among the nearest NEIGHBOURS. All of fewer than three
-    views do. What one mask alone shows is mostly what it shows beside the object.
+    to the nearest point of another view; that is looked for among the nearest NEIGHBOURS, unless
+    most points have none there. All of fewer than three views do. What one mask alone shows is
+    mostly what it shows beside the object.
     """
     count = min(NEIGHBOURS, len(points))
     if len(np.unique(views)) < 3:
         return np.ones(len(points), bool)
     distance_m, nearest = KDTree(points).query(points, count)
     other_m = np.where(views[nearest] != views[:, None], distance_m, np.inf).min(axis=1)
+    if not np.isfinite(np.median(other_m)):  # views lie apart, or have very many points
+        other_m = _to_other_views(points, views)
     near = np.asarray(other_m <= max(reach_m, 3 * float(np.median(other_m))))
-    return near & np.isfinite(other_m) if np.isfinite(other_m).any() else ~near
+    return near & np.isfinite(other_m)
+
+
+def _to_other_views(points: Array, views: Ints) -> Array:
+    """Distance (N,) of each of the points (N, 3) to the nearest one of another view (N,)."""
+    distance_m = np.empty(len(points))
+    for view in np.unique(views).tolist():
+        own = views == view
+        distance_m[own] = KDTree(points[~own]).query(points[own])[0]
+    return distance_m
 
 
 def main_part(points: Array, cell_m: float, share: float) -> Mask:

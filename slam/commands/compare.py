@@ -107,6 +107,6 @@ def _seeds(text: str | None) -> tuple[int, ...] | None:
     names = _names(text)
     if names is None:
         return None
-    if not all(name.isdigit() for name in names):
+    if not all(name.isdecimal() for name in names):
         raise InputError(f"--seeds {text}: write whole numbers, as 0,1,2")
     return tuple(dict.fromkeys(map(int, names)))

@@ -93,7 +93,7 @@ def _optimise(arguments: argparse.Namespace) -> int:
 
     if arguments.input.is_dir() and not is_run_folder(arguments.input):
         return _folder(arguments)
-    if arguments.ray or arguments.jobs:
+    if arguments.ray or arguments.jobs is not None:
         raise InputError(
             f"--ray, --jobs: are for a folder of graphs or runs; leave them out for "
             f"{arguments.input}"

@@ -47,6 +47,10 @@ class FolderOptions:
     ray: str | None = None
     quiet: bool = False
 
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise InputError(f"--jobs {self.workers}: must be at least 1")
+
 
 def optimise_folder(options: FolderOptions) -> list[tuple[Job, Outcome]]:
     """Optimise all; what was done with the same input and arguments is not done again.

@@ -49,14 +49,7 @@ def export(source: Path, form: ExportFormat, out: Path, times: Path | None = Non
         InputError: broken input, a source without the data that the format needs, or an output
             that is the input or lies in a missing folder.
     """
-    if not out.parent.is_dir():
-        raise InputError(f"{out}: the folder {out.parent} does not exist; make it first")
-    if out.is_dir():
-        raise InputError(f"{out}: a folder; give the name of a file to write")
-    if not source.exists():
-        raise InputError(f"{source}: no such file or folder; give a run folder or a trajectory")
-    if source.resolve() == out.resolve() or out.resolve().parent == source.resolve():
-        raise InputError(f"{out}: is (in) the input, which stays as it is; choose another --out")
+    _check_paths(source, _files(form, out), times)
     if form == "g2o":
         return _graph(source, out)
     if form in ("scene-graph", "objects-ply"):
@@ -69,6 +62,29 @@ def export(source: Path, form: ExportFormat, out: Path, times: Path | None = Non
     if form == "ply" and source.is_dir():
         return _landmarks(source, out)
     return _trajectory(source, form, out, times)
+
+
+def _files(form: ExportFormat, out: Path) -> tuple[Path, ...]:
+    """What is written; in KITTI's format the stamps have a file of their own."""
+    return (out, out.parent / f"{out.stem}_times.txt") if form == "kitti" else (out,)
+
+
+def _check_paths(source: Path, files: tuple[Path, ...], times: Path | None) -> None:
+    """Refuse outputs that are read too, or cannot be written. Raises InputError."""
+    out = files[0]
+    if not out.parent.is_dir():
+        raise InputError(f"{out}: the folder {out.parent} does not exist; make it first")
+    if not source.exists():
+        raise InputError(f"{source}: no such file or folder; give a run folder or a trajectory")
+    whole = source.resolve()
+    inputs = (whole,) if times is None else (whole, times.resolve())
+    for file in files:
+        if file.is_dir():
+            raise InputError(f"{file}: a folder; give the name of a file to write")
+        if file.resolve() in inputs or file.resolve().parent == whole:
+            raise InputError(
+                f"{file}: is (in) the input, which stays as it is; choose another --out"
+            )
 
 
 def _graph(source: Path, out: Path) -> Exported:
@@ -132,10 +148,10 @@ def _write(trajectory: Trajectory, form: ExportFormat, out: Path) -> tuple[tuple
         write_euroc(out, trajectory)
         return (out,), "stamp in nanoseconds, position in metres, quaternion w x y z"
     if form == "kitti":
-        times = out.with_name(f"{out.stem}_times.txt")
+        files = _files(form, out)
         write_kitti(out, trajectory.poses_world_camera)
-        write_times(times, trajectory.timestamps_s)
-        return (out, times), "the upper three rows of the matrix; the stamps are in the second file"
+        write_times(files[1], trajectory.timestamps_s)
+        return files, "the upper three rows of the matrix; the stamps are in the second file"
     x, y, z = trajectory.positions_world.T
     write_ply(out, {"x": x, "y": y, "z": z, "t": trajectory.timestamps_s}, POSITIONS_COMMENT)
     return (out,), "x y z in metres and the stamp t in seconds"

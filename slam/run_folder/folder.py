@@ -72,7 +72,7 @@ SOMETIMES = (
     *(CHECKPOINT, CAMERA, COVARIANCES, HEALTH, JOINED, MARKERS, REPORT, FILM),
     *SEMANTIC_FILES,
 )
-OF_MERGED_RUNS = "trajectory_run_*.txt"
+OTHER_PATHS = "trajectory_*_*.txt"  # of segments, and of merged runs
 ELSEWHERE = "choose another folder with --out"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("bmask_slam",)
@@ -267,7 +267,7 @@ def _clear(path: Path, overwrite: bool) -> None:
         if (path / FRAMES).is_file():
             with (path / FRAMES).open("rb") as file:
                 lock_file(file, path)
-        _remove(path, [*held, *(old.name for old in path.glob(OF_MERGED_RUNS) if held)])
+        _remove(path, [*held, DENSE, *(f.name for f in path.glob(OTHER_PATHS))] if held else [])
 
 
 def _make_folder(path: Path) -> list[Path]:

@@ -107,11 +107,11 @@ def recorded_camera(
     """
     if isinstance(given, Camera):
         return given, "given"
-    file = folder / "camera.yaml" if given is None or is_preset(given) else given
+    preset = str(given) if is_preset(given) else preset_of_folder(folder)
+    file, said = folder / "camera.yaml" if given is None or is_preset(given) else given, set[str]()
     if file == given or file.is_file():
-        return read_camera(file), str(file)
-    preset = str(given) if given is not None else preset_of_folder(folder)
-    camera, added = completed(own, (), preset)
+        (own, said), source = _read(file), str(file)
+    camera, added = completed(own, said, preset)
     return camera, ", ".join(filter(None, (source, added)))
 
 

@@ -42,6 +42,8 @@ class Frame:
 def check_frame(frame: Frame, camera: Camera, last_stamp_s: float = -math.inf) -> Frame:
     """The frame as tracking needs it: float32 depth, NaN where it was 0 or the image is covered.
 
+    The colour image is contiguous, also where a view such as ``bgr[..., ::-1]`` was given.
+
     Args:
         last_stamp_s: stamp of the frame before.
 
@@ -65,7 +67,7 @@ def check_frame(frame: Frame, camera: Camera, last_stamp_s: float = -math.inf) -
     depth_m = _checked_depth(frame.depth_m, where)
     if camera.covered:
         depth_m = without_covered(depth_m.copy(), camera)
-    return replace(frame, depth_m=depth_m)
+    return replace(frame, rgb=np.ascontiguousarray(frame.rgb), depth_m=depth_m)
 
 
 def reduced_frame(frame: Frame, k: int) -> Frame:

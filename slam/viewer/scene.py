@@ -69,9 +69,10 @@ class Scene:
     def log_camera(self, camera: Camera) -> None:
         """Show the camera's field of view; the path begins anew."""
         self._path.clear()
-        size = camera.width // IMAGE_STEP, camera.height // IMAGE_STEP
+        size = -(-camera.width // IMAGE_STEP), -(-camera.height // IMAGE_STEP)
+        K = np.diag([1 / IMAGE_STEP, 1 / IMAGE_STEP, 1.0]) @ camera.K
         for each in self._transports:
-            each.camera(camera.K / IMAGE_STEP, size)
+            each.camera(K, size)
 
     def log_names(self, names: Sequence[str]) -> None:
         """The names of the classes, by number."""

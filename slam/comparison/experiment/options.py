@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
@@ -134,22 +134,32 @@ def select_part(experiment: Experiment, options: CompareOptions) -> Experiment:
         for s in experiment.sequences
         if s.name in selected
     )
+    seeds = options.seeds or experiment.seeds
     return replace(
-        _without_others(experiment, selected),
+        _without_others(experiment, selected, seeds),
         sequences=sequences,
         configurations={
             k: v for k, v in experiment.configurations.items() if rows is None or k in rows
         },
-        seeds=options.seeds or experiment.seeds,
+        seeds=seeds,
         with_scale=experiment.with_scale or options.with_scale,
     )
 
 
-def _without_others(experiment: Experiment, selected: set[str]) -> Experiment:
-    """Without the trajectories and published figures of other sequences."""
+def _without_others(experiment: Experiment, selected: set[str], seeds: Sequence[int]) -> Experiment:
+    """Without the trajectories and published figures of other sequences, and of other seeds.
+
+    A rendered sequence looks otherwise with each seed; of a recorded one seeds are repetitions.
+    """
+    rendered = {source.name for source in experiment.sequences if source.render is not None}
+
+    def is_wanted(key: str) -> bool:
+        name, _, seed = key.partition("@")
+        is_other = name in rendered and seed.isdecimal() and int(seed) not in seeds
+        return name in selected and not is_other
 
     def only(values: Mapping[str, Value]) -> dict[str, Value]:
-        return {key: value for key, value in values.items() if key.partition("@")[0] in selected}
+        return {key: value for key, value in values.items() if is_wanted(key)}
 
     systems = {
         name: replace(system, trajectories=only(system.trajectories))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import socket
 import threading
 import time
@@ -31,6 +32,7 @@ CONNECT_S = 2.0
 STOP_S = 0.1
 SILENT_S = 1.5
 """A machine that acknowledges nothing for so long is away. Much longer, and tracking is lost."""
+_ADDRESS = re.compile(r"(?:\[([^][]+)\]|([^][:]+))(?::([0-9]{1,5}))?")
 CURE = "does bmask-slam workstation --host ADDRESS run there?"
 
 
@@ -86,16 +88,20 @@ class Workstation:
     def of(cls, address: str, token_file: Path | None = None) -> Workstation:
         """That of HOST or HOST:PORT, with the token of a file.
 
+        HOST may be an address of IPv6, which needs [brackets] where a port follows.
+
         Raises:
             InputError: the address or the token is none.
         """
-        host, colon, port = address.rpartition(":")
-        if not colon:
-            host, port = address, str(PORT)
-        if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
-            raise InputError(f"--workstation {address}: no address; write HOST or HOST:PORT")
+        is_bare = address.count(":") > 1 and "[" not in address  # of IPv6, without a port
+        found = _ADDRESS.fullmatch(f"[{address}]" if is_bare else address)
+        port = int(found[3] or PORT) if found else 0
+        if found is None or not 0 < port < 1 << 16:
+            raise InputError(
+                f"--workstation {address}: no address; write HOST or HOST:PORT, as [::1]:{PORT}"
+            )
         token = read_token(token_file or default_token_file())
-        return cls(host.strip("[]"), int(port), token)
+        return cls(found[1] or found[2], port, token)
 
     def is_reachable(self) -> bool:
         """Whether something answers there."""
@@ -114,7 +120,8 @@ class Workstation:
             WorkstationAwayError: the workstation cannot be reached.
             InputError: it has another token or version, or ``host`` is no name of one.
         """
-        where = f"the workstation {self.host}:{self.port}"
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        where = f"the workstation {host}:{self.port}"
         try:
             end = socket.create_connection((self.host, self.port), CONNECT_S)
             try:

@@ -43,20 +43,22 @@ class RecordedSource:
 
     def _frames(self) -> Iterator[Frame]:
         """The frames, from the sequence with the camera that is used when each is read."""
-        sequence, start, last_s = self._sequence, 0, -np.inf
+        sequence, start, last_s, broken_before = self._sequence, 0, -np.inf, 0
         gaps = GapMeter(self.counts)
         while start < len(sequence):
             camera = sequence.camera
             with closing(sequence.frames(start)) as frames:
                 for frame in frames:
                     start, last_s = frame.index + 1, frame.timestamp_s
-                    self.counts.broken = len(sequence.skipped)
+                    self.counts.broken = broken_before + len(sequence.skipped)
                     gaps.count(last_s)
                     yield frame
                     if self.camera != camera:
                         break
                 else:
+                    self.counts.broken = broken_before + len(sequence.skipped)
                     return
+            broken_before += sum(index < start for index, _ in sequence.skipped)  # of those read
             sequence = sequence.with_camera(self.camera)
             start = int(np.searchsorted(sequence.timestamps_s, last_s, side="right"))
 

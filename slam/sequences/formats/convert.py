@@ -77,8 +77,11 @@ def convert(
     metre becomes 5000. The files of sensors beside the images are copied.
 
     Raises:
-        InputError: the recording cannot be read, holds no readable image, or the folder is there.
+        InputError: the recording cannot be read, holds no readable image, the folder is there, or
+            ``max_images`` is below 1.
     """
+    if max_images is not None and max_images < 1:
+        raise InputError(f"--max-frames {max_images}: must be a whole number of at least 1")
     if folder.exists():
         raise InputError(f"{folder}: is there already; give the name of a new folder")
     recording = open_recording(source, camera)

@@ -21,6 +21,7 @@ from bmask_slam.mapping.inverse_depth.matching_cost import (
 )
 from bmask_slam.mapping.inverse_depth.plane_sweep import (
     SweepConfig,
+    _enlarged,
     fill_missing,
     shrunk_camera,
     sweep,
@@ -169,6 +170,14 @@ def test_a_scaled_camera_has_the_same_rays() -> None:
     np.testing.assert_allclose(
         small.project(point), (CAMERA.project(point) + 0.5) / 2 - 0.5, atol=1e-9
     )
+
+
+def test_each_pixel_has_the_estimate_of_its_block_in_odd_images_too() -> None:
+    blocks = torch.arange(240.0 * 160).reshape(240, 160)
+    whole = _enlarged(InverseDepthMap(blocks, blocks), (481, 321))
+    expected = blocks.repeat_interleave(2, dim=0).repeat_interleave(2, dim=1)
+    assert (whole.rho[:480, :320] == expected).all()
+    assert (whole.rho[480, :320] == expected[479]).all() and whole.rho[480, 320] == blocks[-1, -1]
 
 
 def test_measurements_are_preferred_to_the_sweep() -> None:

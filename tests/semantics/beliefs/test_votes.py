@@ -150,6 +150,17 @@ def test_near_a_border_depth_decides_the_side() -> None:
     assert vote(assignment, pixels[[0, 1]], z_m[[0, 1]], 4, without).rows.tolist() == []
 
 
+def test_near_a_border_depth_is_that_of_the_place_in_odd_images_too() -> None:
+    size = SIZE[0] + 1, SIZE[1] + 1
+    chair = replace(CHAIR, mask=np.pad(CHAIR.mask, ((0, 1), (0, 1))))
+    depth_m = np.full(size, 4.0, np.float32)
+    depth_m[chair.mask] = 2.0
+    assignment = assign_pixels([chair], depth_m[::2, ::2], size, CONFIG)
+    pixels, z_m = np.array([[31.0, 50.0], [31.0, 50.0]]), np.array([2.02, 4.0])
+    found = vote(assignment, pixels, z_m, 4, CONFIG)
+    assert found.rows.tolist() == [0] and found.instances.tolist() == [0]
+
+
 def test_at_a_border_of_two_instances_of_a_class_only_the_class_is_known() -> None:
     for label, rows in ((1, [0]), (2, [])):
         right = instance(slice(20, 80), slice(90, 140), label, 0.7)

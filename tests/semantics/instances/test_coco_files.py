@@ -153,6 +153,23 @@ def test_impossible_images_are_refused(tmp_path: Path, change: dict[str, Any], w
     assert words in str(caught.value)
 
 
+@pytest.mark.parametrize("listed", ["images", "categories"])
+def test_ids_that_stand_twice_are_refused(tmp_path: Path, listed: str) -> None:
+    """As in a file that was joined from two."""
+    path = write(tmp_path / "c.json", [annotation()])
+    content = json.loads(path.read_text())
+    first = content[listed][0]
+    content[listed].append({**first, **({"file_name": "b.png"} if "file_name" in first else {})})
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=rf"id {first['id']} stands 2 times"):
+        read_coco(path)
+
+
+def test_a_score_that_rounding_put_above_one_is_one(tmp_path: Path) -> None:
+    path = write(tmp_path / "c.json", [annotation(score=1.0000001)])
+    assert read_coco(path).images[0].objects[0].score == 1.0
+
+
 def test_run_lengths_start_with_zeros() -> None:
     mask = np.array([[True, False], [True, True]])
     assert run_lengths(mask) == [0, 2, 1, 1]

@@ -59,6 +59,14 @@ def test_what_one_view_alone_shows_is_not_seen_again() -> None:
     assert seen_again(points, np.minimum(views, 1), 0.03).all()  # of two views nobody knows
 
 
+@pytest.mark.parametrize("apart_m", [0.03, 0.06])
+def test_views_that_lie_apart_show_each_other(apart_m: float) -> None:
+    """Depth of three views of a plate differs; a point's neighbours are all of its own view."""
+    plate = np.stack(np.meshgrid(*[np.linspace(0, 0.2, 18)] * 2, [0.0]), axis=-1).reshape(-1, 3)
+    points = np.concatenate([plate + np.array([0, 0, k * apart_m]) for k in range(3)])
+    assert seen_again(points, np.repeat(np.arange(3), len(plate)), 0.08).all()
+
+
 def test_lone_points_are_not_supported() -> None:
     rng = np.random.default_rng(2)
     size_m = np.ones(3)

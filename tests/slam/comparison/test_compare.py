@@ -225,6 +225,7 @@ def test_names_outside_the_experiment_are_rejected(data, tmp_path, options, mess
     [
         (["rendred"], "no such file; there are: bonn"),
         (["rendered", "--seeds", "0,x"], "--seeds 0,x: write whole numbers"),
+        (["rendered", "--seeds", "\N{SUPERSCRIPT TWO}"], ": write whole numbers, as 0,1,2"),
         (["rendered", "--reference", "x"], "--reference x: write it as SEQUENCE=FILE"),
         (["rendered", "--trajectory", "x"], "--trajectory x: write it as METHOD:SEQUENCE=FILE"),
         (["rendered", "--jobs", "0"], "--jobs 0: must be at least 1"),

@@ -11,6 +11,7 @@ from bmask_slam.comparison.experiment.data_folders import data_folders, locate_s
 from bmask_slam.comparison.experiment.experiment import (
     Configuration,
     Experiment,
+    OtherSystem,
     Quotation,
     SequenceSource,
 )
@@ -251,3 +252,13 @@ def test_the_remaining_time_is_estimated_from_the_same_group():
         assert bar.remaining_s() == (10 + 10) / 2
         bar.update(jobs[2], Outcome(CellStatus.FAILED, wall_s=1))
         assert bar.remaining_s() == 5
+
+
+def test_trajectories_of_seeds_that_are_not_compared_are_left_out() -> None:
+    """A rendered sequence looks otherwise with each seed; a recorded one is the same."""
+    sources = SequenceSource("room", render=RenderConfig("office")), SequenceSource("desk", "desk")
+    files = {f"{name}@{seed}": f"{name}{seed}.txt" for name in ("room", "desk") for seed in (0, 1)}
+    systems = {"ORB": OtherSystem(trajectories=files)}
+    whole = Experiment("mine", "", Path("mine.yaml"), sources, seeds=(0, 1), systems=systems)
+    part = select_part(whole, CompareOptions(seeds=(1,)))
+    assert set(part.systems["ORB"].trajectories) == {"room@1", "desk@0", "desk@1"}

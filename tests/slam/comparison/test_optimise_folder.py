@@ -77,3 +77,15 @@ def test_folders_and_options_that_do_not_fit(capsys, tmp_path: Path) -> None:
     assert "no run folder" in capsys.readouterr().err
     assert cli.main(["optimise", str(tmp_path / "a.g2o"), "--out", "x.g2o", "--jobs", "2"]) == 1
     assert "--jobs" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("jobs", ["0", "-3"])
+def test_less_than_one_job_at_a_time_is_refused(capsys, pools, tmp_path: Path, jobs: str) -> None:
+    (tmp_path / "a.g2o").write_text(GRAPH)
+    words = ["--out", str(tmp_path / "out"), "--jobs", jobs]
+    assert cli.main(["optimise", str(tmp_path), *words]) == 1
+    assert f"--jobs {jobs}: must be at least 1" in capsys.readouterr().err
+    assert cli.main(["optimise", str(tmp_path / "a.g2o"), *words]) == 1
+    assert "--ray, --jobs: are for a folder" in capsys.readouterr().err
+    assert not pools
+    assert not (tmp_path / "out").exists()

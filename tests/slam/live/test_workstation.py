@@ -227,6 +227,30 @@ def test_tokens(tmp_path: Path) -> None:
         Workstation.of("host:port", path)
 
 
+@pytest.mark.parametrize(
+    ("address", "host", "port"),
+    [
+        ("::1", "::1", 7717),
+        ("[::1]", "::1", 7717),
+        ("[fe80::1%eth0]:80", "fe80::1%eth0", 80),
+        ("fe80::1:2", "fe80::1:2", 7717),
+        ("robot", "robot", 7717),
+        ("10.0.0.1:80", "10.0.0.1", 80),
+    ],
+)
+def test_addresses_have_a_host_and_a_port(tmp_path: Path, address: str, host: str, port) -> None:
+    make_token(tmp_path / "token")
+    found = Workstation.of(address, tmp_path / "token")
+    assert (found.host, found.port) == (host, port)
+
+
+@pytest.mark.parametrize("address", ["", ":80", "[]:80", "[::1", "[::1]80", "a:", "a:0", "a:65536"])
+def test_what_is_no_address_is_refused(tmp_path: Path, address: str) -> None:
+    make_token(tmp_path / "token")
+    with pytest.raises(InputError, match=r"no address; write HOST or HOST:PORT, as \[::1\]:7717"):
+        Workstation.of(address, tmp_path / "token")
+
+
 def test_the_command_makes_a_token_and_listens(tmp_path, monkeypatch, capsys) -> None:
     served: list[Any] = []
     monkeypatch.setattr(WorkstationServer, "serve", lambda self, ends: served.append(ends()))

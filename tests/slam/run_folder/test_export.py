@@ -114,6 +114,7 @@ def test_points(run: Path, tmp_path: Path) -> None:
         (["run", "--format", "tum", "--out", "no/a"], "the folder no does not exist"),
         (["run", "--format", "tum", "--out", "run"], "a folder; give the name of a file"),
         (["run", "--format", "tum", "--out", "run/trajectory.txt"], "is (in) the input"),
+        (["run", "--format", "kitti", "--out", "."], ".: a folder; give the name of a file"),
         (
             ["run/trajectory.txt", "--format", "g2o", "--out", "a"],
             "has no graph, which g2o needs",
@@ -133,4 +134,24 @@ def test_errors_are_one_line(
     errors = capsys.readouterr().err
     assert message in errors
     assert errors.count("\n") == 1
+    assert not Path("a").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "written"),
+    [
+        (["a_times.txt", "--format", "kitti", "--out", "a.txt"], "a_times.txt"),
+        (["kitti.txt", "--times", "a_times.txt", "--format", "kitti", "--out", "a"], "a_times.txt"),
+        (["kitti.txt", "--times", "a_times.txt", "--format", "tum", "--out", "a_times.txt"], ""),
+    ],
+)
+def test_what_is_read_is_not_written(capsys, run: Path, monkeypatch, words, written: str) -> None:
+    monkeypatch.chdir(run.parent)
+    assert export("run", "--format", "kitti", "--out", "kitti.txt") == 0
+    from_times = "--times" in words
+    given = Path("kitti_times.txt" if from_times else "run/trajectory.txt").read_bytes()
+    Path("a_times.txt").write_bytes(given)
+    assert export(*words) == 1
+    assert f"{written or words[-1]}: is (in) the input, which stays" in capsys.readouterr().err
+    assert Path("a_times.txt").read_bytes() == given
     assert not Path("a").exists()

@@ -43,6 +43,9 @@ def test_overwrite_removes_only_the_run(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text("earlier")
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "trajectory_run_2.txt").write_text("of a merged run")
+    (tmp_path / "trajectory_segment_1.txt").write_text("of another segment")
+    (tmp_path / "dense").mkdir()
+    (tmp_path / "dense/cloud.ply").write_text("of the earlier map")
     with RunFolder(tmp_path, overwrite=True):
         pass
     names = ["events.csv", "frames.csv", "log.txt", "notes.txt"]

@@ -10,7 +10,13 @@ import pytest
 from bmask_slam.graph.camera import Camera, DepthNoise
 from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences.camera_presets import FOLDERS, PRESETS
-from bmask_slam.sequences.cameras import CAMERA_EXAMPLE, find_camera, given_camera, read_camera
+from bmask_slam.sequences.cameras import (
+    CAMERA_EXAMPLE,
+    find_camera,
+    given_camera,
+    read_camera,
+    recorded_camera,
+)
 from bmask_slam.sequences.cameras import write_camera as write_file
 
 LINES = {
@@ -204,6 +210,17 @@ def test_a_key_in_the_file_wins_over_preset_and_name(tmp_path, value):
     write_camera(folder, rolling_shutter=value)
     assert find_camera(folder)[0].rolling_shutter_s == value
     assert find_camera(folder, Path("kinect-v1"))[0].rolling_shutter_s == value
+
+
+def test_a_preset_adds_to_the_file_beside_a_recording_that_tells_its_camera(tmp_path):
+    folder = tmp_path / "7-Scenes-heads"
+    folder.mkdir()
+    write_camera(folder)
+    own = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+    for given in (None, Path("kinect-v1")):
+        camera, _ = recorded_camera(own, "7-Scenes", folder, given)
+        assert (camera.fx, camera.rolling_shutter_s) == (527.27, 0.026)
+    assert recorded_camera(own, "7-Scenes", folder, Path("kinect-v1"))[0].depth_noise is not None
 
 
 def test_the_preset_given_wins_over_the_name_and_leaves_intrinsics(tmp_path):

@@ -138,6 +138,7 @@ def test_the_image_its_camera_and_the_masks_fit(messages) -> None:
     assert np.abs(picture[9, 9].astype(int) - (20, 10, 250)).max() < 8  # blue first
     camera = messages["/camera/calibration"][0]
     assert (camera.width, camera.height, camera.K[0]) == (320, 240, 262.5)
+    assert list(camera.K[6:]) == [0, 0, 1]
     masks = messages["/keyframe/masks"][0]
     (outline,), (name,) = masks.points, masks.texts  # the unsure one is left out
     assert name.text == "chair 0.90"

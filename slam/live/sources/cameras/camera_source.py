@@ -54,15 +54,19 @@ class CameraSource(MeasuredSource, ABC):
         self._silence_s = silence_s
         self._failures: tuple[type[Exception], ...] = (RuntimeError,)  # as of bindings of C++
         self._closed = threading.Event()
+        self._lock = threading.Lock()  # of the two that follow
+        self._is_read = self._is_released = False
 
     def frames(self) -> Iterator[Frame]:
-        """Each frame as soon as it is captured; the device is released at the end.
+        """Each frame as soon as it is captured; the device is released at the end or by ``close``.
 
         Raises:
             InputError: none came for ``silence_s``, or the device's library failed.
         """
         clock, gaps = StreamClock(self.counts), GapMeter(self.counts)
         index, heard_s = 0, time.monotonic()
+        with self._lock:
+            self._is_read = True
         try:
             while not self._closed.is_set():
                 images = self._captured()
@@ -77,11 +81,21 @@ class CameraSource(MeasuredSource, ABC):
                     yield Frame(index, stamp_s, images.rgb, images.depth_m)
                     index += 1
         finally:
-            self._release()
+            self._release_once()
 
     def close(self) -> None:
-        """End ``frames`` soon; may be called from any thread."""
+        """End ``frames`` soon, or release the device if they have not begun; from any thread."""
         self._closed.set()
+        with self._lock:
+            is_read = self._is_read
+        if not is_read:
+            self._release_once()
+
+    def _release_once(self) -> None:
+        with self._lock:
+            is_released, self._is_released = self._is_released, True
+        if not is_released:
+            self._release()
 
     def _captured(self) -> CameraImages | None:
         try:

@@ -48,7 +48,7 @@ class Record3dSource(CameraSource):
         self._new, self._stamp_s = threading.Event(), 0.0
         self._stream = self._library.Record3DStream()
         self._stream.on_new_frame = self._on_frame
-        self._stream.on_stream_stopped = self.close
+        self._stream.on_stream_stopped = self._closed.set  # no release in the library's thread
         if not self._stream.connect(devices[device]):
             raise InputError(f"{self.name}: does not connect; start USB streaming in Record3D")
         try:

@@ -289,3 +289,28 @@ def test_close_ends_it_and_releases_the_device(camera_file: Path) -> None:
     threading.Timer(0.1, source.close).start()
     assert len(list(source.frames())) == 4
     assert Capture.made.released
+
+
+def test_close_releases_a_device_whose_frames_never_began(monkeypatch) -> None:
+    device = Device([frameset(0, 1000)])
+    plug_in(monkeypatch, device)
+    source = RealSenseSource(silence_s=SILENCE_S)
+    stream = source.frames()
+    source.close()
+    assert device.stopped == 1
+    assert list(stream) == []
+    source.close()
+    assert device.stopped == 1
+
+
+def test_close_leaves_the_device_to_the_frames_that_have_begun(monkeypatch) -> None:
+    device = Device([frameset(0, 1000)])
+    plug_in(monkeypatch, device)
+    source = RealSenseSource(silence_s=SILENCE_S)
+    stream = source.frames()
+    next(stream)
+    source.close()
+    assert device.stopped == 0
+    assert list(stream) == []
+    source.close()
+    assert device.stopped == 1

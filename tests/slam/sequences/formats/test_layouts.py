@@ -10,6 +10,7 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from small_layouts import (
@@ -305,3 +306,45 @@ def test_a_line_of_euroc_without_a_stamp_is_named(tmp_path: Path, line: str) -> 
     (folder / "data.csv").write_text(f"# stamp,name\n{line}\n")
     with pytest.raises(InputError, match=r"data\.csv:2: .*no stamp in nanoseconds"):
         euroc._images(folder)
+
+
+def euroc_without_intrinsics_of_depth(tmp_path: Path, place: str, said: str) -> Path:
+    """Depth of 2 m registered to colour, whose sensor.yaml has ``T_BS`` of cam0 or depth0."""
+    folder = write_small(SMALL_LAYOUTS[6], tmp_path)
+    texts = {name: (folder / f"mav0/{name}/sensor.yaml").read_text() for name in ("cam0", "depth0")}
+    T_BS = texts[place].partition("resolution")[0] if place else ""
+    (folder / "mav0/depth0/sensor.yaml").write_text(f"{T_BS}{said}\n")
+    height, width = SMALL_LAYOUTS[6].camera.height, SMALL_LAYOUTS[6].camera.width
+    for file in (folder / "mav0/depth0/data").iterdir():
+        cv2.imwrite(str(file), np.full((height, width), 10000, np.uint16))
+    return folder
+
+
+@pytest.mark.parametrize("place", ["cam0", ""])
+def test_registered_depth_of_euroc_has_the_scale_that_it_tells(tmp_path: Path, place: str) -> None:
+    folder = euroc_without_intrinsics_of_depth(tmp_path, place, "depth_scale: 5000")
+    sequence = open_sequence(folder)
+    assert sequence.camera.depth_scale == 5000
+    np.testing.assert_allclose(sequence.load(0).depth_m, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("place", "said", "message"),
+    [
+        ("depth0", "depth_scale: 5000", r"depth0.sensor\.yaml: T_BS is another than cam0's"),
+        ("cam0", "depth_scale: 0", r"depth0.sensor\.yaml: depth_scale is 0; it must be"),
+        ("cam0", "depth_scale: many", r"depth_scale is 'many'; it must be a number"),
+    ],
+)
+def test_depth_of_euroc_that_cannot_be_placed_is_refused(tmp_path, place, said, message) -> None:
+    with pytest.raises(InputError, match=message):
+        open_sequence(euroc_without_intrinsics_of_depth(tmp_path, place, said))
+
+
+@pytest.mark.parametrize("count", [0, -3])
+def test_less_than_one_image_to_convert_is_refused(tmp_path: Path, capsys, count: int) -> None:
+    folder, out = write_small(SMALL_LAYOUTS[0], tmp_path), tmp_path / "out"
+    assert main(["convert", str(folder), str(out), "--max-frames", str(count)]) == 1
+    message = f"--max-frames {count}: must be a whole number of at least 1"
+    assert message in capsys.readouterr().err
+    assert not out.exists()
