@@ -84,8 +84,13 @@ def cache_masks(
     """Segment images (name, file) that are not in the cache, and write one COCO file of all.
 
     Raises:
-        InputError: the folder holds masks made with other settings, or no image can be read.
+        InputError: the folder holds masks made with other settings, two images differ in the
+            suffix alone, or no image can be read.
     """
+    names: dict[str, str] = {}
+    for name, _ in files:
+        if (first := names.setdefault(name.rpartition(".")[0], name)) != name:
+            raise InputError(f"{first} and {name} differ in the suffix alone; rename one of them")
     with_surfaces = _check_settings(options)
     entries: list[dict[str, Any]] = []
     reused = broken = 0

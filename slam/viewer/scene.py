@@ -14,6 +14,7 @@ from bmask_slam.graph.arrays import Array, Bytes, Floats, Image, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import refuse_link
+from bmask_slam.graph.files.whole_file import check_target
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 from bmask_slam.viewer.foxglove_transport import FoxgloveTransport
@@ -53,7 +54,11 @@ class Scene:
         self._rerun = RerunTransport(name, options) if options.in_rerun else None
         self._transports: list[Transport] = [self._rerun] if self._rerun else []
         if options.in_foxglove:
-            self._transports.append(FoxgloveTransport(name, options))
+            try:
+                self._transports.append(FoxgloveTransport(name, options))
+            except InputError:
+                self.close()
+                raise
         self._path: list[Array] = []
 
     @property
@@ -197,4 +202,5 @@ class Scene:
 def _check_folder(file: Path) -> None:
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder; make it first")
+    check_target(file)
     refuse_link(file)

@@ -184,6 +184,15 @@ def test_a_folder_of_other_surface_classes_is_refused(tmp_path: Path, images: li
         cache_masks(Painter(), images, options, quiet)
 
 
+def test_images_that_differ_in_the_suffix_alone_are_refused(tmp_path: Path, images: list) -> None:
+    name, path = images[0]
+    other = f"{name.rpartition('.')[0]}.jpg"
+    with pytest.raises(InputError, match=f"{name} and {other} differ in the suffix alone"):
+        options = CacheOptions(tmp_path / "masks", {"name": "x"})
+        cache_masks(Drawer(), [*images, (other, path)], options, quiet)
+    assert not (tmp_path / "masks").exists()
+
+
 def test_cached_images_are_not_segmented_again(tmp_path: Path, images: list) -> None:
     options = CacheOptions(tmp_path / "masks", {"name": "x"}, overlays=False)
     drawer = Drawer()

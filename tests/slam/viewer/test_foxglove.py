@@ -26,6 +26,7 @@ from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
+from bmask_slam.viewer import scene
 from bmask_slam.viewer.options import ViewOptions
 from bmask_slam.viewer.scene import Scene
 from bmask_slam.viewer.shown import Box, Ellipsoid, as_jpeg
@@ -251,11 +252,18 @@ def test_a_client_that_comes_later_gets_every_topic(tmp_path: Path) -> None:
     scene.close()
 
 
-def test_a_taken_port_and_a_foreign_address(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_taken_port_and_a_foreign_address(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"port {port} of 127.0.0.1: .*--foxglove PORT"):
             Scene("a", ViewOptions(foxglove_port=port))
+        ended: list[object] = []
+        monkeypatch.setattr(scene.RerunTransport, "close", lambda self: ended.append(self))
+        with pytest.raises(InputError, match=f"port {port}"):
+            Scene("a", ViewOptions(record=tmp_path / "a.rrd", foxglove_port=port))
+        assert len(ended) == 1
     Scene("a", ViewOptions(foxglove_port=free_port(), host="0.0.0.0")).close()
     assert "0.0.0.0: everyone who reaches" in caplog.text
 

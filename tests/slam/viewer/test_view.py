@@ -81,6 +81,12 @@ def test_a_recording_in_a_missing_folder_is_refused(tmp_path) -> None:
         Scene("a", ViewOptions(record=tmp_path / "none" / "a.rrd"))
 
 
+def test_a_recording_that_is_a_folder_is_refused(tmp_path) -> None:
+    for options in (ViewOptions(record=tmp_path), ViewOptions(foxglove_file=tmp_path)):
+        with pytest.raises(InputError, match="is a folder"):
+            Scene("a", options)
+
+
 def test_what_cannot_be_shown_leaves_an_earlier_recording(tmp_path, capsys) -> None:
     file = tmp_path / "a.rrd"
     file.write_text("precious")
