@@ -12,6 +12,7 @@ from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -259,11 +260,11 @@ def test_a_taken_port_and_a_foreign_address(
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"port {port} of 127.0.0.1: .*--foxglove PORT"):
             Scene("a", ViewOptions(foxglove_port=port))
-        ended: list[object] = []
-        monkeypatch.setattr(scene.RerunTransport, "close", lambda self: ended.append(self))
+        closing = mock.Mock()
+        monkeypatch.setattr(scene.RerunTransport, "close", closing)
         with pytest.raises(InputError, match=f"port {port}"):
             Scene("a", ViewOptions(record=tmp_path / "a.rrd", foxglove_port=port))
-        assert len(ended) == 1
+        closing.assert_called_once()
     Scene("a", ViewOptions(foxglove_port=free_port(), host="0.0.0.0")).close()
     assert "0.0.0.0: everyone who reaches" in caplog.text
 
