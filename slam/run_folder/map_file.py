@@ -90,7 +90,8 @@ def read_run(path: Path) -> SavedRun:
         InputError: a file that is missing or broken, or keyframes.txt and graph of different runs.
     """
     if not (path / "graph").is_file():
-        raise InputError(f"{path}: holds no graph; give a run that made a map and came to its end")
+        cure = "give the folder of a run that came to its end, without --localise"
+        raise InputError(f"{path}: holds no graph; {cure}")
     tables, camera = read_graph(path / "graph")
     config = path / "config.yaml"
     graph_config = resolve(SmootherConfig, config if config.is_file() else None, section="graph")
