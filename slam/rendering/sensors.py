@@ -129,7 +129,7 @@ def write_sensors(folder: Path, wanted: SensorsOf, poses: Array, path: CameraPat
             rows = positions(poses, stamps_s, config.position, rng)
         else:
             mounting = T_of(config.accelerometer.accelerometer_in_camera)
-            count = int(len(poses) / wanted.fps * FORCE_HZ)
+            count = max(int(len(poses) / wanted.fps * FORCE_HZ), 3)  # for an acceleration
             fine = camera_poses(path, FORCE_HZ, wanted.seed, sweeping=wanted.sweeping)[:count]
             if name == "imu":
                 rows = imu(fine, FORCE_HZ, config.imu, rng)

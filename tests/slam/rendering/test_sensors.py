@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,3 +45,10 @@ def test_the_sensors_of_a_rendered_sequence_fit_its_truth(tmp_path: Path) -> Non
 def test_an_unknown_sensor_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="sensor 'sonar' is unknown; choose of odometry"):
         render_sequence(RenderConfig("corridor", 2, sensors=("sonar",)), tmp_path / "out")
+
+
+@pytest.mark.parametrize("fps", [10.0, 500.0])
+def test_a_single_image_has_sensors_too(tmp_path: Path, fps: float) -> None:
+    config = replace(CONFIG, frames=1, fps=fps, sensors=("imu", "accelerometer"))
+    folder = render_sequence(config, tmp_path / "out")
+    assert [len(found.rows) >= 3 for found in read_folder(folder, config.sensors)] == [True] * 2
