@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -87,10 +87,7 @@ def cache_masks(
         InputError: the folder holds masks made with other settings, two images differ in the
             suffix alone, or no image can be read.
     """
-    names: dict[str, str] = {}
-    for name, _ in files:
-        if (first := names.setdefault(name.rpartition(".")[0], name)) != name:
-            raise InputError(f"{first} and {name} differ in the suffix alone; rename one of them")
+    _check_names(name for name, _ in files)
     with_surfaces = _check_settings(options)
     entries: list[dict[str, Any]] = []
     reused = broken = 0
@@ -117,6 +114,14 @@ def cache_masks(
     _write_json(options.out / ANNOTATIONS, content)
     count = len(content["annotations"])
     return CacheResult(options.out / ANNOTATIONS, len(entries), count, reused, broken)
+
+
+def _check_names(names: Iterable[str]) -> None:
+    """Raise InputError for two that differ in the suffix alone: they would share files."""
+    known: dict[str, str] = {}
+    for name in names:
+        if (first := known.setdefault(name.rpartition(".")[0], name)) != name:
+            raise InputError(f"{first} and {name} differ in the suffix alone; rename one of them")
 
 
 def _check_settings(options: CacheOptions) -> bool:

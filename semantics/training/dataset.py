@@ -181,13 +181,10 @@ def scaled(sample: Sample, factor: float) -> Sample:
     matrix = np.hstack([np.eye(2) * factor, (centre * (1 - factor))[:, None]])
     size = (width, height)
     image = cv2.warpAffine(sample.image, matrix, size, borderValue=(114, 114, 114))
-    planes = [
-        cv2.warpAffine(m.astype(np.uint8), matrix, size, flags=cv2.INTER_NEAREST)
-        for m in sample.masks
-    ]
-    return _visible(
-        Sample(np.asarray(image, np.uint8), np.stack(planes).astype(bool), sample.labels)
-    )
+    masks = np.zeros((len(sample.masks), height, width), bool)  # none after some pasting
+    for k, mask in enumerate(sample.masks):
+        masks[k] = cv2.warpAffine(mask.astype(np.uint8), matrix, size, flags=cv2.INTER_NEAREST)
+    return _visible(Sample(np.asarray(image, np.uint8), masks, sample.labels))
 
 
 def copy_paste(sample: Sample, other: Sample, rng: np.random.Generator) -> Sample:

@@ -261,7 +261,7 @@ def _resume(
 ) -> int:
     """Load the checkpoint, if any, and cut the curves at it; the next step."""
     if not (out / STATE).is_file():
-        _write(out / CURVES, [CURVES_HEAD])
+        cut_curves(out / CURVES, 0)
         return 0
     content, cure = read_pickle(out / STATE), "choose another --out or delete it"
     try:
@@ -279,15 +279,21 @@ def _resume(
         raise InputError(
             f"{out / STATE}: not the state of this training ({in_short(error)}); {cure}"
         ) from error
-    lines = list(read_lines(out / CURVES, cure))[1:]
-    rows = [(line, whole_number(line.split(",")[0], f"{out / CURVES}:{k}")) for k, line in lines]
-    _write(out / CURVES, [CURVES_HEAD, *(line for line, of in rows if of < step)])
+    cut_curves(out / CURVES, step)
     return step
 
 
-def _write(path: Path, lines: list[str]) -> None:
+def cut_curves(path: Path, step: int) -> None:
+    """Leave in losses.csv what was before a step, at which a training goes on; 0: begin the file.
+
+    Raises:
+        InputError: the file is missing or broken.
+    """
+    lines = list(read_lines(path, "choose another --out or delete it"))[1:] if step else []
+    rows = [(line, whole_number(line.split(",")[0], f"{path}:{k}")) for k, line in lines]
+    kept = [CURVES_HEAD, *(line for line, of in rows if of < step)]
     with whole_file(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        temporary.write_text("\n".join(kept) + "\n", encoding="utf-8")
 
 
 def _comparable(config: TrainingConfig) -> dict[str, str]:

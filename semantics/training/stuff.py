@@ -22,10 +22,11 @@ from bmask_slam.semantics.network.backbone.layers import keep_variance
 from bmask_slam.semantics.network.yolox.layers import ConvSiLU
 from bmask_slam.semantics.network.yolox.network import YoloxNano
 from bmask_slam.semantics.network.yolox.stuff import StuffHead
+from bmask_slam.semantics.training.loop import CURVES, cut_curves
 from bmask_slam.semantics.training.stuff_images import IGNORED, Augmentation, augmented
 from bmask_slam.semantics.weights.checkpoints import read_pickle
 
-STATE, CURVES = "stuff_training.pt", "losses.csv"
+STATE = "stuff_training.pt"
 LOSS_STRIDE = 4
 PRETRAINED = ("stage_16.", "stage_32.")
 """Beginnings of the names of parameters that start from the detector's."""
@@ -280,12 +281,12 @@ def _save(out: Path, parts: dict[str, Any], step: int, config: StuffTrainingConf
 def _resume(out: Path, parts: dict[str, Any], config: StuffTrainingConfig) -> int:
     """Load the checkpoint of this training, if there is one; the next step."""
     if not (out / STATE).is_file():
-        with whole_file(out / CURVES) as temporary:
-            temporary.write_text("step,loss,value\n", encoding="utf-8")
+        cut_curves(out / CURVES, 0)
         return 0
     content = read_pickle(out / STATE)
     if content["config"] != str(asdict(config)):
         raise InputError(f"{out}: holds a training with other settings; choose another folder")
     for name, part in parts.items():
         part.load_state_dict(content[name])
+    cut_curves(out / CURVES, int(content["step"]))
     return int(content["step"])

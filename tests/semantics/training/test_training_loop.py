@@ -37,6 +37,7 @@ from bmask_slam.semantics.training.loop import (
     STATE,
     Only,
     TrainingConfig,
+    cut_curves,
     draw_batch,
     train,
     trainable,
@@ -89,6 +90,22 @@ def test_augmentation_moves_masks_with_their_objects() -> None:
     assert float(image.max()) <= 1
     for box, mask in zip(target.boxes, target.masks, strict=True):
         assert box.tolist() == mask_box(mask.numpy()).tolist()
+
+
+def test_an_image_whose_objects_were_all_too_small_stays_without() -> None:
+    sample = painted(0)
+    nothing = Sample(sample.image, sample.masks[:0], sample.labels[:0])
+    found = scaled(nothing, 1.3)
+    assert found.masks.shape == (0, 60, 80) and len(found.labels) == 0
+
+
+def test_curves_are_cut_where_a_training_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "losses.csv"
+    cut_curves(path, 0)
+    assert path.read_text() == "step,loss,value\n"
+    path.write_text("step,loss,value\n0,box,1\n1,box,2\n2,box,3\n")
+    cut_curves(path, 2)
+    assert path.read_text() == "step,loss,value\n0,box,1\n1,box,2\n"
 
 
 def test_augmentation_repeats_from_its_seed() -> None:
