@@ -25,12 +25,12 @@ class InputError(Exception):
 
 
 @contextmanager
-def naming(where: str, cure: str) -> Iterator[None]:
-    """Put ``where`` before, and the ``cure`` after, what an InputError of the block says."""
+def naming(where: str, cure: str = "") -> Iterator[None]:
+    """Put ``where`` before, and a ``cure`` after, what an InputError of the block says."""
     try:
         yield
     except InputError as error:
-        raise InputError(f"{where}: {error}; {cure}") from error
+        raise InputError("; ".join(filter(None, (f"{where}: {error}", cure)))) from error
 
 
 def one_line(message: str) -> str:

@@ -25,8 +25,7 @@ from benchmarks.semantics.nyuv2 import CLASSES, GROUP_OF, GROUPS, labelled, numb
 from benchmarks.semantics.train_stuff import held_out
 from bmask_slam.graph.arrays import Array, Bytes, Image, Ints
 from bmask_slam.graph.files.data_files import data_path
-from bmask_slam.semantics.network.yolox.network import PAD_VALUE
-from bmask_slam.semantics.training.stuff_images import IGNORED
+from bmask_slam.semantics.training.stuff_images import IGNORED, placed
 from bmask_slam.semantics.weights import light_weights, stuff_weights
 
 
@@ -46,12 +45,9 @@ def figures(counts: Ints) -> tuple[Array, Array, float]:
 
 def seen_from(image: Image, labels: Bytes, scale: float, turn_deg: float) -> tuple[Image, Bytes]:
     """An image (H, W, 3) and its classes (H, W), enlarged and turned about the middle."""
-    size = image.shape[1], image.shape[0]
-    matrix = cv2.getRotationMatrix2D((size[0] / 2, size[1] / 2), turn_deg, scale)
-    outside, nothing = (PAD_VALUE,) * 3, (IGNORED,)
-    placed = cv2.warpAffine(image, matrix, size, flags=cv2.INTER_LINEAR, borderValue=outside)
-    classes = cv2.warpAffine(labels, matrix, size, flags=cv2.INTER_NEAREST, borderValue=nothing)
-    return np.asarray(placed, np.uint8), np.asarray(classes, np.uint8)
+    height, width = labels.shape
+    matrix = cv2.getRotationMatrix2D((width / 2, height / 2), turn_deg, scale)
+    return placed(image, labels, np.asarray(matrix, float), (height, width))
 
 
 def measure(weights: Path, part: str, scale: float, turn_deg: float) -> None:

@@ -92,8 +92,7 @@ def seen_again(points: Array, views: Ints, reach_m: float) -> Mask:
     other_m = np.where(views[nearest] != views[:, None], distance_m, np.inf).min(axis=1)
     if not np.isfinite(np.median(other_m)):  # views lie apart, or have very many points
         other_m = _to_other_views(points, views)
-    near = np.asarray(other_m <= max(reach_m, 3 * float(np.median(other_m))))
-    return near & np.isfinite(other_m)
+    return np.asarray(other_m <= max(reach_m, 3 * float(np.median(other_m))))
 
 
 def _to_other_views(points: Array, views: Ints) -> Array:

@@ -44,11 +44,18 @@ def augmented(
 ) -> tuple[Image, Bytes]:
     """A piece of a turned, scaled, mirrored image (H, W, 3) with its labels (H, W)."""
     matrix = _placement((image.shape[0], image.shape[1]), config, rng)
-    size = config.size[::-1]
-    outside = (PAD_VALUE,) * 3
-    piece = cv2.warpAffine(image, matrix, size, flags=cv2.INTER_LINEAR, borderValue=outside)
-    classes = cv2.warpAffine(labels, matrix, size, flags=cv2.INTER_NEAREST, borderValue=(IGNORED,))
-    return _recoloured(np.asarray(piece, np.uint8), config, rng), np.asarray(classes, np.uint8)
+    piece, classes = placed(image, labels, matrix, config.size)
+    return _recoloured(piece, config, rng), classes
+
+
+def placed(
+    image: Image, labels: Bytes, matrix: Array, size: tuple[int, int]
+) -> tuple[Image, Bytes]:
+    """An image and its labels moved by an affine map (2, 3) into those of a size (H, W)."""
+    outside, nothing, shape = (PAD_VALUE,) * 3, (IGNORED,), size[::-1]
+    piece = cv2.warpAffine(image, matrix, shape, flags=cv2.INTER_LINEAR, borderValue=outside)
+    classes = cv2.warpAffine(labels, matrix, shape, flags=cv2.INTER_NEAREST, borderValue=nothing)
+    return np.asarray(piece, np.uint8), np.asarray(classes, np.uint8)
 
 
 def _placement(shape: tuple[int, int], config: Augmentation, rng: np.random.Generator) -> Array:

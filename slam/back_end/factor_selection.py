@@ -119,7 +119,7 @@ class FactorSelector:
             poses_world_camera=keyframe.T_world_camera[None],
             landmark_ids=new_ids,
             points_world=world.landmarks.points_world[new_ids],
-            priors=() if last is not None else (self._prior(keyframe),),
+            priors=(self._prior(keyframe),) if last is None else (),
             relative_poses=anchors,
             marginalise_landmarks=marginalised,
         )

@@ -32,6 +32,7 @@ from bmask_slam.graph.calibration.registration import EdgeScores, Registration, 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.run_folder.metrics import row
+from bmask_slam.sequences.info import depth_statistics
 from bmask_slam.sequences.sequence import Sequence
 
 logger = logging.getLogger(__name__)
@@ -110,12 +111,9 @@ def check_camera(run: SavedRun, sequence: Sequence) -> CameraCheck:
 def depth_warning(sequence: Sequence) -> str:
     """What is wrong with the unit of depth: a camera sees things that are near, but not too near.
 
-    "" where nothing is, or no image has depth. Raises InputError: images cannot be read.
+    "" where nothing is, or no image has depth.
     """
-    frames = np.unique(np.linspace(0, len(sequence) - 1, DEPTH_FRAMES).astype(int))
-    depths_m = np.concatenate([sequence.load(k).depth_m.ravel() for k in frames.tolist()])
-    depths_m = depths_m[np.isfinite(depths_m)]
-    median_m = float(np.median(depths_m)) if len(depths_m) else np.nan
+    _, (_, median_m, _) = depth_statistics(sequence, DEPTH_FRAMES)
     if not (median_m < NEAREST_M or median_m > FARTHEST_M):
         return ""
     scale = sequence.camera.depth_scale

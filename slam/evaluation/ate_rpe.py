@@ -14,7 +14,7 @@ from bmask_slam.evaluation.recordings import OVERLAPPING, MergedClock, merged_cl
 from bmask_slam.evaluation.reference import file_in, read_reference, reference_file
 from bmask_slam.events import read_events
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.errors import InputError, finite_number
+from bmask_slam.graph.errors import InputError, finite_number, naming
 from bmask_slam.graph.files.reading import read_table
 from bmask_slam.graph.geometry import so3_log
 from bmask_slam.graph.hand_eye import body_trajectory, hand_eye
@@ -143,12 +143,10 @@ def evaluate(
     frames = 0 if frames_s is None else len(frames_s)
     estimate = clock.own_trajectory(read_trajectory(file, stamps_s))
     truth = read_reference(truth_file, stamps_s)
-    try:
+    with naming(f"{file} against {truth_file}"):
         estimate, body = _of_body(estimate, truth) if with_body else (estimate, [])
         result = evaluate_trajectory(estimate, truth, frames, with_scale)
         result.rows.extend(body)
-    except InputError as error:
-        raise InputError(f"{file} against {truth_file}: {error}") from error
     if plot is not None:
         from bmask_slam.evaluation.plot import plot_trajectory  # noqa: PLC0415 - matplotlib loads slowly
 

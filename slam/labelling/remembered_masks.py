@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, step_of
 from bmask_slam.semantics.beliefs.pixel_assignment import PixelAssignment
 from bmask_slam.semantics.beliefs.votes import PixelStack
 from bmask_slam.semantics.instances.instances import Instance
@@ -176,10 +176,10 @@ def _restored_surfaces(names: LabelSet, state: Arrays, count: int) -> list[Coded
 
 def _thinned(assignment: PixelAssignment) -> PixelAssignment:
     """Every THINNED-th pixel each way of a keyframe's masks and depth, without those masks."""
-    step = THINNED * assignment.depth_m.shape[0] // assignment.owner.shape[0]
+    step = max(THINNED // step_of(assignment.owner.shape[0], assignment.depth_m.shape[0]), 1)
     every = np.s_[::THINNED, ::THINNED]
     owner, under, inner = assignment.owner[every], assignment.under[every], assignment.inner[every]
-    depth_m = assignment.depth_m[:: max(step, 1), :: max(step, 1)]
+    depth_m = assignment.depth_m[::step, ::step]
     without = tuple(replace(i, mask=_NO_MASK) for i in assignment.instances)
     return PixelAssignment(without, owner, under, inner, depth_m, assignment.depth_range_m)
 

@@ -106,10 +106,10 @@ def _camera_checked(run: ActiveRun) -> CameraCheck:
     nothing = CameraCheck((), (), ())
     if not isinstance(run.system, SlamSystem) or run.stop.signal is not None:
         return nothing
+    if unit := depth_warning(run.sequence):
+        logger.warning("camera: %s", unit)
+        return CameraCheck((unit,), (), (row("camera_warnings", 1, "1"),))
     try:
-        if unit := depth_warning(run.sequence):
-            logger.warning("camera: %s", unit)
-            return CameraCheck((unit,), (), (row("camera_warnings", 1, "1"),))
         checked = check_camera(run.system.as_run(), run.sequence)
     except InputError as error:
         logger.info("camera not checked: %s", error)

@@ -21,7 +21,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import part
 from bmask_slam.labelling.awaited_masks import LAG
 from bmask_slam.labelling.mask_memory import MaskMemory
-from bmask_slam.live.messages import FramesTracked, Handled, ImageToSegment, Masks, SaveState
+from bmask_slam.live.messages import FramesTracked, ImageToSegment, Masks, SaveState
 from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.processes.map_worker import MapWorker
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
@@ -55,7 +55,7 @@ class LockstepMapper(RemoteMapper):
 
     def _begin(self) -> None:
         """A process begins, to which nothing was sent."""
-        self._handled = self._due = 0  # numbers of messages
+        self.handled = self._due = 0  # numbers of messages
         self._answers: deque[Any] = deque()
         self._ends: deque[int] = deque()  # last messages of frames
         self._kept: list[Any] = []
@@ -85,7 +85,7 @@ class LockstepMapper(RemoteMapper):
             return super().catch_up(timeout_s)
         others, self._kept = self._kept, []
         until_s = time.monotonic() + WAIT_S
-        while self._handled < self._due and (self._answers or self._is_to_come()):
+        while self.handled < self._due and (self._answers or self._is_to_come()):
             if self._answers:
                 others += self._apply_answers([self._answers.popleft()])
                 continue
@@ -100,15 +100,7 @@ class LockstepMapper(RemoteMapper):
 
     def _is_to_come(self) -> bool:
         """Whether something that is due will still be answered."""
-        return not self.worker.given_up and self.worker.lacks(self._handled, self._due)
-
-    def _apply_answers(self, messages: list[Any]) -> list[Any]:
-        others = []
-        for message in messages:
-            if isinstance(message, Handled):
-                self._handled = max(message.number, self._handled)
-            others += super()._apply_answers([message])
-        return others
+        return not self.worker.given_up and self.worker.lacks(self.handled, self._due)
 
     def send_frames(self) -> None:
         """Tell the map of the frames since the last keyframe, if there are any."""

@@ -10,7 +10,7 @@ from bmask_slam.evaluation import evaluate_trajectory, read_reference
 from bmask_slam.evaluation.plot import draw_errors, draw_events, draw_top_view
 from bmask_slam.evaluation.reference import reference_file
 from bmask_slam.events import Event
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, naming
 from bmask_slam.graph.metrics import absolute_error
 from bmask_slam.graph.trajectory import Trajectory, associate
 from bmask_slam.reporting.drawing import as_picture, figure
@@ -57,10 +57,8 @@ def with_errors(
     kept = {name: metric for name, metric in metrics.items() if not name.startswith(ERRORS)}
     if not trajectory:
         return kept
-    try:
+    with naming(f"{files[0]} against {reference_file(files[1])}"):
         rows = evaluate_trajectory(trajectory, reference).rows
-    except InputError as error:
-        raise InputError(f"{files[0]} against {reference_file(files[1])}: {error}") from error
     return {row["name"]: Metric(row["value"], row["unit"]) for row in rows} | kept
 
 

@@ -58,7 +58,7 @@ def sequence_info(sequence: Sequence, sample_frames: int = 8) -> SequenceInfo:
     step_s = np.diff(stamps_s)
     typical_s = float(np.median(step_s)) if len(step_s) else float("nan")
     gaps = np.flatnonzero(step_s > GAP_STEPS * typical_s)
-    valid_share, percentiles_m = _depth_statistics(sequence, sample_frames)
+    valid_share, percentiles_m = depth_statistics(sequence, sample_frames)
     share, length_m = _groundtruth_statistics(sequence)
     return SequenceInfo(
         folder=sequence.folder,
@@ -120,15 +120,15 @@ def info_as_json(info: SequenceInfo) -> str:
     return format_json(info)
 
 
-def _depth_statistics(sequence: Sequence, count: int) -> tuple[float, tuple[float, float, float]]:
-    """Share of valid pixels and depth percentiles in metres over a few readable frames."""
+def depth_statistics(sequence: Sequence, count: int) -> tuple[float, tuple[float, float, float]]:
+    """Share of valid pixels and depth percentiles in metres over a few readable frames, or NaN."""
     depths_m = []
     for index in np.unique(np.linspace(0, len(sequence) - 1, count, dtype=int)):
         try:
             depths_m.append(sequence.load(int(index)).depth_m)
         except InputError:
             continue
-    values_m = np.stack(depths_m)
+    values_m = np.stack(depths_m) if depths_m else np.zeros(0)
     valid_m: Array = values_m[np.isfinite(values_m)].astype(float)
     if not len(valid_m):
         return 0.0, (np.nan, np.nan, np.nan)

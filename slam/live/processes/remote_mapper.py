@@ -68,7 +68,7 @@ class RemoteMapper:
         update_ms: time that the process took for each keyframe.
         changes: how often the copy was updated.
         reference: the keyframe that tracking refers to; set before ``insert``.
-        handled: number of the last message that the process has handled.
+        handled: largest number of a message that the process has handled.
         worker: the process that owns the map.
         objects: as the process told them last; None before.
         maps_saved: answers to ``SaveMap``, which their reader removes.
@@ -221,7 +221,7 @@ class RemoteMapper:
                 case MapSaved():
                     self.maps_saved.append(message)
                 case Handled():
-                    self.handled = message.number
+                    self.handled = max(message.number, self.handled)
                 case _:
                     others.append(message)
         return others
