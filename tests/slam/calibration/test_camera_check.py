@@ -26,6 +26,7 @@ from bmask_slam.calibration.edge_scores import correlation, edge_scores, edges_o
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import plot
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
 from bmask_slam.offline.runner import RunOptions, RunSummary, run
 from bmask_slam.run_folder.map_file import read_run
 from bmask_slam.sequences.cameras import write_camera
@@ -191,3 +192,17 @@ def test_a_wrong_unit_of_depth_is_told(depth_m: float, text: str) -> None:
     sequence: Any = Images(frames)
     found = depth_warning(sequence)
     assert found.startswith(text) and bool(found) == bool(text)
+
+
+def test_a_broken_image_does_not_hide_a_wrong_unit_of_depth() -> None:
+    class Images(list[SimpleNamespace]):
+        camera = Camera(6, 4, 5.0, 5.0, 3.0, 2.0)
+
+        def load(self, index: int) -> SimpleNamespace:
+            if index == 1:
+                raise InputError("1.png: broken")
+            return self[index]
+
+    frame = SimpleNamespace(depth_m=np.full((4, 6), 9000, np.float32))
+    sequence: Any = Images([frame] * 3)
+    assert depth_warning(sequence).startswith("depth: 9000 m in the median")
