@@ -142,11 +142,11 @@ def read_saved_map(path: Path) -> SavedMap:
         labels = saved_labels(part(state, "semantics"), path)
         up_world = _measured_up(part(state, "mapper.graph"), segment)
         sides = _sides(part(state, "semantics.upright"))
+        first = int(state.get("first_keyframe", 0))
     keyframes = world.in_segment(segment)
     if (path / JOINED).is_file():
         own = [k for k in keyframes if np.isfinite(k.timestamp_s)]
     else:
-        first = int(state.get("first_keyframe", 0))
         own = [k for k in keyframes if k.id >= first]
     foreign = len(keyframes) - len(own)
     return SavedMap(path, world, own, camera, labels, sides, up_world, foreign)
