@@ -37,6 +37,7 @@ from bmask_slam.calibration.rematching import estimate_again
 from bmask_slam.calibration.views import sensor_sigmas
 from bmask_slam.graph.arrays import Array, Ints, no_ids
 from bmask_slam.graph.calibration.model import TIME
+from bmask_slam.graph.calibration.registration import Registration
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
@@ -138,13 +139,12 @@ class CalibrationServer:
         except InputError as error:
             logger.info("calibration: %s", error)
             estimate = None
-        by_motion = before
-        if estimate is not None:
-            logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
-            by_motion = judged(before, estimate, setup.mode, config, setup.free)
-        state, doubt = self._by_edges(by_motion, run, world)
-        doubt = doubt or self._doubt(state, estimate)
-        self._state, text = state, "; ".join(filter(None, (state.text, doubt)))
+        edges = self._registration(run, world)
+        by_motion, contradicted = self._by_motion(estimate, edges, run.camera)
+        state, doubt = self._by_edges(by_motion, edges, run.camera)
+        if self._lacks_delay(state):
+            doubt = _joined(contradicted, doubt) or self._doubt(state, estimate)
+        self._state, text = state, _joined(state.text, doubt)
         shown = estimate is not None and estimate.shows(TIME, config)
         clear = not doubt and (shown or not self._lacks_delay(state))
         last = self._looks >= config.stretches
@@ -162,28 +162,55 @@ class CalibrationServer:
         """Whether they are kept: as long as no delay is known."""
         return self._setup.looks_at_edges and TIME not in adopted_parameters(self._state)
 
-    def _by_edges(
-        self, state: SelfCalibration, run: SavedRun, world: WorldMap
-    ) -> tuple[SelfCalibration, str]:
-        """The state with a delay of depth that its edges show, if that is large.
-
-        Also a warning, if they show one that is no right camera's, and is not used.
-        """
+    def _registration(self, run: SavedRun, world: WorldMap) -> Registration | None:
+        """How depth lies on colour by its edges; None where they are not kept or are not clear."""
         path = run.trajectories["trajectory.txt"]
         kept = [k for k in self._edges if k in world.keyframes]
-        if TIME in adopted_parameters(state) or not kept or not len(path):
-            return state, ""
+        if not self._looks_at_edges or not kept or not len(path):
+            return None
         twists = twists_at(path, np.array([world.keyframes[k].timestamp_s for k in kept]))
         moving = np.flatnonzero(twists.any(axis=1))
         edges = [self._edges[kept[i]] for i in moving.tolist()]
-        scores = scores_of(edges, twists[moving], run.camera)
-        found = sure_registration(scores)
-        late = with_sure_delay(state, found, run.camera.depth_time_offset_s)
-        return (state, delay_warning(found, run.camera)) if late is None else (late, "")
+        return sure_registration(scores_of(edges, twists[moving], run.camera))
+
+    def _by_motion(
+        self, estimate: Estimate | None, edges: Registration | None, camera: Camera
+    ) -> tuple[SelfCalibration, str]:
+        """The state after an estimate with a map of ``camera``, and what is not used of it.
+
+        That is a delay that edges surely contradict, however sure: depth that comes much too late
+        bends the map, and with it what the motion says.
+        """
+        setup, before = self._setup, self._state
+        if estimate is None:
+            return before, ""
+        logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
+        state = judged(before, estimate, setup.mode, setup.config, setup.free)
+        if edges is None or TIME not in adopted_parameters(state):
+            return state, ""
+        more_s = state.camera.depth_time_offset_s - camera.depth_time_offset_s
+        left = replace(edges, delay_s=edges.delay_s - more_s)
+        if not delay_warning(left, state.camera):
+            return state, ""
+        others = tuple(i for i in setup.free if i != TIME)
+        contradicted = format_found(estimate, (TIME,), "edges of depth contradict it, not applied")
+        return judged(before, estimate, setup.mode, setup.config, others), contradicted
+
+    def _by_edges(
+        self, state: SelfCalibration, edges: Registration | None, camera: Camera
+    ) -> tuple[SelfCalibration, str]:
+        """The state with a delay of depth that edges show on a map of ``camera``, if it is large.
+
+        Also a warning, if they show one that is no right camera's, and is not used.
+        """
+        if edges is None or TIME in adopted_parameters(state):
+            return state, ""
+        late = with_sure_delay(state, edges, camera.depth_time_offset_s)
+        return (state, delay_warning(edges, camera)) if late is None else (late, "")
 
     def _doubt(self, state: SelfCalibration, estimate: Estimate | None) -> str:
         """A delay that is not sure enough to be adopted beside what was; "" if there is none."""
-        if estimate is None or not state.adopted or not self._lacks_delay(state):
+        if estimate is None or not state.adopted:
             return ""
         differs = estimate.differs(TIME, self._setup.config)
         return format_found(estimate, (TIME,), "not sure enough to be applied") if differs else ""
@@ -210,6 +237,10 @@ class CalibrationServer:
 
         retimed = offset_s != run.camera.depth_time_offset_s
         return keyframe_motions(world, paths, change if retimed else None)
+
+
+def _joined(*texts: str) -> str:
+    return "; ".join(filter(None, texts))
 
 
 def _is_bent(world: WorldMap, run: SavedRun, camera: Camera) -> bool:

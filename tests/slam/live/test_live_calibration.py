@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,26 +18,31 @@ from recorded_bags import DEPTH, INFO, RGB, BagMaker, image
 from shifted_stamps import with_depth_stamps
 from synthetic_view import CAMERA
 
-from bmask_slam.calibration.adoption import SelfCalibrationConfig
+from bmask_slam.calibration.adoption import FREE, SelfCalibrationConfig
+from bmask_slam.calibration.keyframe_depth import DepthImage, KeyframeImages
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation.ate_rpe import evaluate_trajectory
 from bmask_slam.events import EventKind
+from bmask_slam.graph.calibration.registration import Registration
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.files.array_file import write_arrays
 from bmask_slam.live import live_map, start, system
 from bmask_slam.live import play as play_module
 from bmask_slam.live.live_slam import LiveSlam
-from bmask_slam.live.messages import EstimateCamera
+from bmask_slam.live.messages import STATE_FILE, EstimateCamera
 from bmask_slam.live.play import PlayOptions, play
-from bmask_slam.live.processes import remote_calibration
-from bmask_slam.live.processes.calibration_process import CalibrationSetup
+from bmask_slam.live.processes import calibration_process, remote_calibration
+from bmask_slam.live.processes.calibration_process import CalibrationServer, CalibrationSetup
 from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.recorded_source import RecordedSource
 from bmask_slam.live.start import LiveOptions
 from bmask_slam.run_folder.map_file import read_map, read_run
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.sequences.cameras import read_camera
+from bmask_slam.sequences.frame import Frame
 from bmask_slam.sequences.sequence import Sequence, open_sequence
+from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 
 CONFIG = resolve(
@@ -228,3 +233,43 @@ def test_an_estimate_whose_map_was_not_saved_is_given_up(monkeypatch, end: str) 
     calibration.update(mapper)
     assert calibration.busy == (end == "written")
     assert sent == ([EstimateCamera(Path("old"))] if end == "written" else [])
+
+
+def test_a_delay_by_the_motion_that_edges_contradict_is_held_back(
+    late_sweep, monkeypatch, tmp_path
+) -> None:
+    sequence, state = open_sequence(late_sweep), tmp_path / "state.npz"
+    images = followed(sequence, state)
+    setup = CalibrationSetup(
+        sequence.camera, CONFIG.graph, SelfCalibrationConfig(), "auto", FREE, True
+    )
+    for edges_s, used_s in (0.1, 0.1), (0.04, 0.0), (0.03, 0.016):
+        edges = Registration(np.zeros(2), np.ones(2), edges_s, 0.003, 9.0)
+        monkeypatch.setattr(calibration_process, "sure_registration", lambda _, found=edges: found)
+        server = CalibrationServer(setup)
+        for of_keyframe in images:
+            server.add(of_keyframe)
+        answer = server.estimate(EstimateCamera(state))
+        offset_s = 0.0 if answer.camera is None else answer.camera.depth_time_offset_s
+        assert offset_s == pytest.approx(used_s, abs=0.004)
+        assert ("edges of depth contradict it, not applied" in answer.text) == (used_s == 0)
+        assert not (answer.done and used_s == 0)
+
+
+def followed(sequence: Sequence, state: Path) -> list[KeyframeImages]:
+    """Run a sequence, write the state of its map, and return the images of its keyframes."""
+    system, last, found = SlamSystem(sequence.camera, CONFIG), [], []
+    with closing(sequence.frames()) as frames:
+        for frame in frames:
+            last = [*last[-2:], (frame, system.process(frame).keyframe_id)]
+            if len(last) == 3 and last[1][1] is not None:
+                found.append(images_of(system, last[1][1], [f for f, _ in last]))
+    write_arrays(state, STATE_FILE, {"camera": asdict(sequence.camera)}, system.state())
+    return found
+
+
+def images_of(system: SlamSystem, keyframe_id: int, frames: list[Frame]) -> KeyframeImages:
+    """Those of a keyframe, which is the second of three frames."""
+    before, depth, after = (DepthImage(f.depth_m, f.timestamp_s) for f in frames)
+    pixels = system.map.world.keyframes[keyframe_id].features.image_pixels
+    return KeyframeImages(keyframe_id, frames[1].rgb, pixels, depth, before, after, 0.0)
