@@ -18,6 +18,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, shift
 
 from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.calibration.model import NORMAL_95
 
 MIN_FRAMES = 8
 DELAYS_S = np.arange(-0.12, 0.1201, 0.008)
@@ -61,6 +62,11 @@ class Registration:
     delay_s: float
     delay_sigma_s: float
     strength: float
+
+    def agrees(self, other: Registration) -> bool:
+        """Whether both may show the same delay, by 95 % bounds."""
+        sigma_s = np.hypot(self.delay_sigma_s, other.delay_sigma_s)
+        return bool(abs(self.delay_s - other.delay_s) < NORMAL_95 * sigma_s)
 
 
 def register(edges: EdgeScores) -> Registration | None:

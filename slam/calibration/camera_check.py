@@ -130,20 +130,24 @@ def sure_registration(scores: EdgeScores) -> Registration | None:
 
 
 def with_sure_delay(
-    state: SelfCalibration, found: Registration | None, offset_s: float
+    state: SelfCalibration,
+    found: Registration | None,
+    offset_s: float,
+    least_s: float = LARGE_DELAY_S,
 ) -> SelfCalibration | None:
     """The state with the delay of depth that edges show, if it is far from a right camera's.
 
     So large a delay bends the map, and with it what the motion says of the camera; smaller ones are
     left to that, since edges may deceive where a camera turns evenly: a delay moves them as another
-    place of the depth camera does. ``offset_s`` is the delay of the camera that the run uses.
+    place of the depth camera does. ``offset_s`` is the delay of the camera that the edges were
+    compared with; the other is surely larger than ``least_s``.
     """
     if found is None:
         return None
     found_s, bound_s = round(offset_s + found.delay_s, 4), NORMAL_95 * found.delay_sigma_s
     shown = f"colour-depth delay {1e3 * found_s:.1f} ± {1e3 * bound_s:.1f} ms by edges of depth"
     logger.info("calibration: %s: estimated", shown)
-    if abs(found.delay_s) - bound_s < LARGE_DELAY_S:
+    if abs(found.delay_s) - bound_s < least_s:
         return None
     camera = replace(state.camera, depth_time_offset_s=found_s)
     before = f"{state.text}; " if state.adopted else ""

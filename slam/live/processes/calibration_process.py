@@ -24,7 +24,9 @@ from bmask_slam.calibration.adoption import (
     judged,
 )
 from bmask_slam.calibration.camera_check import (
+    LARGE_DELAY_S,
     MAX_DELAY_S,
+    SURE_DELAY_S,
     delay_warning,
     sure_registration,
     with_sure_delay,
@@ -110,6 +112,8 @@ class CalibrationServer:
         self._depths: dict[int, KeyframeDepth] = {}
         self._edges: dict[int, FrameEdges] = {}
         self._state, self._looks = SelfCalibration(setup.camera, setup.camera), 0
+        self._looks_at_edges = setup.looks_at_edges  # until a delay that they show is used
+        self._registration: Registration | None = None  # of the last look
 
     def add(self, images: KeyframeImages) -> None:
         """Keep what is needed of a keyframe's images."""
@@ -139,9 +143,9 @@ class CalibrationServer:
         except InputError as error:
             logger.info("calibration: %s", error)
             estimate = None
-        edges = self._registration(run, world)
-        by_motion, contradicted = self._by_motion(estimate, edges, run.camera)
-        state, doubt = self._by_edges(by_motion, edges, run.camera)
+        edges = self._register(run, world)
+        by_motion, contradicted = self._by_motion(estimate, edges)
+        state, doubt = self._by_edges(by_motion, edges)
         if self._lacks_delay(state):
             doubt = _joined(contradicted, doubt) or self._doubt(state, estimate)
         self._state, text = state, _joined(state.text, doubt)
@@ -157,13 +161,11 @@ class CalibrationServer:
         done = state.adopted or state.settled
         return CameraEstimated(None, {}, text, last or (done and clear))
 
-    @property
-    def _looks_at_edges(self) -> bool:
-        """Whether they are kept: as long as no delay is known."""
-        return self._setup.looks_at_edges and TIME not in adopted_parameters(self._state)
+    def _register(self, run: SavedRun, world: WorldMap) -> Registration | None:
+        """How depth lies on colour by its edges, with the camera that the run began with.
 
-    def _registration(self, run: SavedRun, world: WorldMap) -> Registration | None:
-        """How depth lies on colour by its edges; None where they are not kept or are not clear."""
+        None where they are not kept, or are not clear.
+        """
         path = run.trajectories["trajectory.txt"]
         kept = [k for k in self._edges if k in world.keyframes]
         if not self._looks_at_edges or not kept or not len(path):
@@ -171,12 +173,12 @@ class CalibrationServer:
         twists = twists_at(path, np.array([world.keyframes[k].timestamp_s for k in kept]))
         moving = np.flatnonzero(twists.any(axis=1))
         edges = [self._edges[kept[i]] for i in moving.tolist()]
-        return sure_registration(scores_of(edges, twists[moving], run.camera))
+        return sure_registration(scores_of(edges, twists[moving], self._setup.camera))
 
     def _by_motion(
-        self, estimate: Estimate | None, edges: Registration | None, camera: Camera
+        self, estimate: Estimate | None, edges: Registration | None
     ) -> tuple[SelfCalibration, str]:
-        """The state after an estimate with a map of ``camera``, and what is not used of it.
+        """The state after an estimate, and what is not used of it.
 
         That is a delay that edges surely contradict, however sure: depth that comes much too late
         bends the map, and with it what the motion says.
@@ -186,27 +188,37 @@ class CalibrationServer:
             return before, ""
         logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
         state = judged(before, estimate, setup.mode, setup.config, setup.free)
-        if edges is None or TIME not in adopted_parameters(state):
-            return state, ""
-        more_s = state.camera.depth_time_offset_s - camera.depth_time_offset_s
-        left = replace(edges, delay_s=edges.delay_s - more_s)
-        if not delay_warning(left, state.camera):
+        newly = adopted_parameters(state) - adopted_parameters(before)
+        if edges is None or TIME not in newly or not self._contradict(edges, state.camera):
             return state, ""
         others = tuple(i for i in setup.free if i != TIME)
         contradicted = format_found(estimate, (TIME,), "edges of depth contradict it, not applied")
         return judged(before, estimate, setup.mode, setup.config, others), contradicted
 
     def _by_edges(
-        self, state: SelfCalibration, edges: Registration | None, camera: Camera
+        self, state: SelfCalibration, edges: Registration | None
     ) -> tuple[SelfCalibration, str]:
-        """The state with a delay of depth that edges show on a map of ``camera``, if it is large.
+        """The state with a delay of depth that its edges show, and the motion does not.
 
-        Also a warning, if they show one that is no right camera's, and is not used.
+        One that is not surely large is used if the last look showed it too. Also a warning, if they
+        show one that is no right camera's, and is not used.
         """
-        if edges is None or TIME in adopted_parameters(state):
+        given, last = self._setup.camera, self._registration
+        self._registration = edges
+        if edges is None or not self._contradict(edges, state.camera):
             return state, ""
-        late = with_sure_delay(state, edges, camera.depth_time_offset_s)
-        return (state, delay_warning(edges, camera)) if late is None else (late, "")
+        confirmed = last is not None and bool(delay_warning(last, given)) and edges.agrees(last)
+        least_s = SURE_DELAY_S if confirmed else LARGE_DELAY_S
+        late = with_sure_delay(state, edges, given.depth_time_offset_s, least_s)
+        if late is None:
+            return state, delay_warning(edges, given)
+        self._looks_at_edges = False
+        return late, ""
+
+    def _contradict(self, edges: Registration, camera: Camera) -> bool:
+        """Whether edges surely show another delay than a camera has, which is no right camera's."""
+        more_s = camera.depth_time_offset_s - self._setup.camera.depth_time_offset_s
+        return bool(delay_warning(replace(edges, delay_s=edges.delay_s - more_s), camera))
 
     def _doubt(self, state: SelfCalibration, estimate: Estimate | None) -> str:
         """A delay that is not sure enough to be adopted beside what was; "" if there is none."""
