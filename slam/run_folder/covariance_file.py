@@ -105,3 +105,14 @@ def _row(line: str, where: str) -> list[float]:
     if not is_whole(words[0]):
         raise InputError(f"{where}: {words[0][:40]!r} is not a keyframe id; correct the line")
     return [finite_number(word, where) for word in words]
+
+
+def rows_of(wanted: Ints, ids: Ints, values: Array) -> Array:
+    """Rows (N, ...) of the wanted ids (N,) from those of ids (M,); NaN for an unknown id."""
+    found = np.full((len(wanted), *values.shape[1:]), np.nan)
+    order = np.argsort(ids)
+    at = np.searchsorted(ids[order], wanted)
+    known = np.flatnonzero(at < len(ids))
+    known = known[ids[order][at[known]] == wanted[known]]
+    found[known] = values[order][at[known]]
+    return found

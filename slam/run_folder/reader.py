@@ -19,7 +19,7 @@ from bmask_slam.graph.files.json_file import STRICT, read_json
 from bmask_slam.graph.files.reading import read_text
 from bmask_slam.graph.sensors.markers import MarkerMap
 from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, Trajectory, nearest_indices, read_tum
-from bmask_slam.run_folder.covariance_file import COVARIANCES, read_covariances
+from bmask_slam.run_folder.covariance_file import COVARIANCES, read_covariances, rows_of
 from bmask_slam.run_folder.folder import CHECKPOINT, DENSE, FILES, trajectory_files
 from bmask_slam.run_folder.frame_file import FRAMES, FrameTable, read_frames
 from bmask_slam.run_folder.landmark_file import (
@@ -191,18 +191,19 @@ class Run:
         """
         if (self.path / COVARIANCES).is_file():
             saved = read_covariances(self.path / COVARIANCES)
-            return _rows_of(self.keyframes.ids, saved.keyframe_ids, saved.covariances)
+            return rows_of(self.keyframes.ids, saved.keyframe_ids, saved.covariances)
         ids, covariances = self._marginals(np.zeros(0, np.int64))[0]
-        return _rows_of(self.keyframes.ids, ids, covariances)
+        return rows_of(self.keyframes.ids, ids, covariances)
 
     @cached_property
     def landmark_covariances(self) -> Array:
         """Covariances (N, 3, 3) of the ``landmarks`` in m^2, world axes; computed from the graph.
 
-        NaN for a landmark that is not in the graph at the end. It takes up to a minute.
+        NaN for a landmark that is not in the graph at the end. It takes up to a minute. InputError
+        also for a singular graph.
         """
         ids, covariances = self._marginals(self.landmarks.ids)[1]
-        return _rows_of(self.landmarks.ids, ids, covariances)
+        return rows_of(self.landmarks.ids, ids, covariances)
 
     @cached_property
     def dense_cloud(self) -> DenseCloud:
@@ -262,12 +263,18 @@ class Run:
     def _marginals(self, landmark_ids: Ints) -> tuple[tuple[Ints, Array], tuple[Ints, Array]]:
         """Ids and covariances of the graph's keyframes, and of those landmarks that it has."""
         from bmask_slam.config.configuration import resolve  # noqa: PLC0415
+        from bmask_slam.graph.smoother.isam2 import SolverError  # noqa: PLC0415
         from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig  # noqa: PLC0415
 
         config = resolve(SmootherConfig, self._file(CONFIG), section="graph")
-        smoother = Smoother.load(self._file("graph"), config)
+        path = self._file("graph")
+        smoother = Smoother.load(path, config)
         known = np.intersect1d(landmark_ids, smoother.state()["landmark_ids"])
-        found = smoother.marginals(known)
+        try:
+            found = smoother.marginals(known)
+        except SolverError as error:
+            cure = "add factors that determine every variable"
+            raise InputError(f"{path}: no covariances, it is singular ({error}); {cure}") from error
         return (found.keyframe_ids, found.keyframes), (found.landmark_ids, found.landmarks)
 
     def _file(self, name: str, option: str = "") -> Path:
@@ -287,14 +294,3 @@ class Run:
         sequence = self.sequence or "SEQUENCE"
         words = ("bmask-slam run", str(sequence), option, f"--out {self.path} --overwrite")
         return f"make it by: {' '.join(filter(None, words))}"
-
-
-def _rows_of(wanted: Ints, ids: Ints, values: Array) -> Array:
-    """Rows (N, ...) of the wanted ids (N,) from those of rising ids (M,); NaN for an unknown id."""
-    found = np.full((len(wanted), *values.shape[1:]), np.nan)
-    order = np.argsort(ids)
-    at = np.searchsorted(ids[order], wanted)
-    known = np.flatnonzero(at < len(ids))
-    known = known[ids[order][at[known]] == wanted[known]]
-    found[known] = values[order][at[known]]
-    return found

@@ -17,6 +17,8 @@ from fake_run import FakeSystem, make_sequence, signal_at, true_pose
 from bmask_slam.api import map_run, run
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.smoother.isam2 import SolverError
+from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.offline import runner
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.rendering.config import RenderConfig
@@ -137,6 +139,15 @@ def test_saved_and_computed_covariances_are_the_same(labelled: Run, tmp_path: Pa
         shutil.copy(labelled.path / name, tmp_path)
     computed = Run(tmp_path).keyframe_covariances
     np.testing.assert_allclose(computed, labelled.keyframe_covariances, rtol=1e-6, atol=1e-18)
+
+
+def test_a_singular_graph_has_no_covariances_and_says_so(labelled: Run, monkeypatch) -> None:
+    def fail(*_: object) -> None:
+        raise SolverError("Indeterminant linear system", ("keyframe", 3))
+
+    monkeypatch.setattr(Smoother, "marginals", fail)
+    with pytest.raises(InputError, match=r"graph: no covariances, it is singular \(Indet"):
+        _ = Run(labelled.path).landmark_covariances
 
 
 def test_landmark_covariances_belong_to_the_landmarks(labelled: Run) -> None:
