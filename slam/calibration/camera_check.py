@@ -1,19 +1,18 @@
 """Whether a run contradicts its camera: focal lengths, registration of depth, stamps.
 
 Nothing here uses a reference. What right cameras show has been measured: published focal lengths
-are up to 1.8 +- 0.6 % from what the motion shows, edges of registered depth within 2 px of those
-of colour, and depth up to 21 ms from its stamps. The limits lie above that (docs/data.md). The
-scale of depth has no statistic: images and depth fit a world of any size equally well.
+are up to 1.8 +- 0.6 % from what the motion shows, and edges of registered depth within 2 px of
+those of colour. The limits lie above that (docs/data.md). The scale of depth has no statistic:
+images and depth fit a world of any size equally well.
 """
 
 from __future__ import annotations
 
-import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.calibration.adoption import SelfCalibration
+from bmask_slam.calibration.edge_delay import MIN_STRENGTH, delay_warning, format_delay
 from bmask_slam.calibration.edge_scores import best_scale, edge_scores
 from bmask_slam.calibration.motion import as_exposed, landmark_motion
 from bmask_slam.calibration.views import connected_views
@@ -28,14 +27,12 @@ from bmask_slam.graph.calibration.model import (
     parameters_of,
 )
 from bmask_slam.graph.calibration.problem import CalibrationProblem
-from bmask_slam.graph.calibration.registration import EdgeScores, Registration, register
+from bmask_slam.graph.calibration.registration import Registration, register
 from bmask_slam.graph.camera import Camera
 from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.run_folder.metrics import row
 from bmask_slam.sequences.info import depth_statistics
 from bmask_slam.sequences.sequence import Sequence
-
-logger = logging.getLogger(__name__)
 
 MAX_KEYFRAMES = 60
 MAX_FOCAL_CHANGE, MAX_FOCAL_BOUND = 0.015, 0.02
@@ -43,14 +40,10 @@ MAX_FOCAL_CHANGE, MAX_FOCAL_BOUND = 0.015, 0.02
 95 % bound is larger than the second."""
 MAX_SHIFT_SHARE = 4 / 640
 """Depth surely further off in the image, as a share of its width, is not registered."""
-MIN_STRENGTH, MIN_STRENGTH_RATIO, MIN_SCALE_CHANGE = 6.0, 1.5, 0.05
-"""Edges of depth and colour fit if their peak is so many sigmas above its surroundings; at another
-scale if that peak is so much stronger and the scale so much different."""
-MAX_DELAY_S, SURE_DELAY_S, MAX_DELAY_BOUND_S = 0.022, 0.015, 0.015
-"""A delay of depth above the first, and surely above the second, is a warning; it is not observable
-if its 95 % bound is larger than the third."""
-LARGE_DELAY_S = 0.035
-"""A delay by edges that is surely larger is adopted before the motion is asked."""
+MIN_STRENGTH_RATIO, MIN_SCALE_CHANGE = 1.5, 0.05
+"""Edges fit at another scale if that peak is so much stronger and the scale so much different."""
+MAX_DELAY_BOUND_S = 0.015
+"""A delay of depth with a larger 95 % bound is not observable."""
 NEAREST_M, FARTHEST_M, DEPTH_FRAMES = 0.1, 50.0, 5
 """A median depth outside these is a wrong unit; by so many images of the sequence."""
 GAUGE_SIGMAS = np.full(6, 1e-4)
@@ -121,43 +114,6 @@ def depth_warning(sequence: Sequence) -> str:
         f"depth: {median_m:.4g} m in the median, with depth_scale {scale:g}; check depth_scale in "
         "camera.yaml, what a depth image has for one metre: 1000, 5000 or, of metres, 1"
     )
-
-
-def sure_registration(scores: EdgeScores) -> Registration | None:
-    """How depth lies on colour by its edges, where these say it clearly."""
-    found = register(scores)
-    return found if found is not None and found.strength >= MIN_STRENGTH else None
-
-
-def with_sure_delay(
-    state: SelfCalibration,
-    found: Registration | None,
-    offset_s: float,
-    least_s: float = LARGE_DELAY_S,
-) -> SelfCalibration | None:
-    """The state with the delay of depth that edges show, if it is far from a right camera's.
-
-    So large a delay bends the map, and with it what the motion says of the camera; smaller ones are
-    left to that, since edges may deceive where a camera turns evenly: a delay moves them as another
-    place of the depth camera does. ``offset_s`` is the delay of the camera that the edges were
-    compared with; the other is surely larger than ``least_s``.
-    """
-    if found is None:
-        return None
-    found_s, bound_s = round(offset_s + found.delay_s, 4), NORMAL_95 * found.delay_sigma_s
-    shown = f"colour-depth delay {1e3 * found_s:.1f} ± {1e3 * bound_s:.1f} ms by edges of depth"
-    logger.info("calibration: %s: estimated", shown)
-    if abs(found.delay_s) - bound_s < least_s:
-        return None
-    camera = replace(state.camera, depth_time_offset_s=found_s)
-    before = f"{state.text}; " if state.adopted else ""
-    return replace(state, camera=camera, text=f"{before}{shown}: found and applied")
-
-
-def delay_warning(found: Registration | None, camera: Camera) -> str:
-    """What edges of depth say against a camera's delay, with a cure; "" where they do not."""
-    finding = None if found is None else _delay(found, camera)
-    return finding.text if finding is not None and finding.is_warning else ""
 
 
 def stored_problem(run: SavedRun) -> CalibrationProblem | None:
@@ -243,11 +199,9 @@ def _delay(found: Registration, camera: Camera) -> _Finding:
         row("camera_depth_delay_ms", 1e3 * delay_s, "ms"),
         row("camera_depth_delay_95_ms", 1e3 * bound_s, "ms"),
     )
-    later = "later" if delay_s > 0 else "earlier"
-    shown = f"{1e3 * abs(delay_s):.0f} ± {1e3 * bound_s:.0f} ms {later} than stamps and camera say"
-    if abs(delay_s) > MAX_DELAY_S and abs(delay_s) - bound_s > SURE_DELAY_S:
-        cure = f"set depth_time_offset: {camera.depth_time_offset_s + delay_s:.3f} in camera.yaml"
-        return _Finding(f"stamps: depth images are {shown}; {cure}", True, rows)
+    if warning := delay_warning(found, camera):
+        return _Finding(warning, True, rows)
     if bound_s > MAX_DELAY_BOUND_S:
+        shown = format_delay(found)
         return _Finding(f"stamps: delay of depth not observable in this motion ({shown})")
-    return _Finding(f"stamps: depth images are {shown}", rows=rows)
+    return _Finding(f"stamps: {format_delay(found)}", rows=rows)

@@ -31,7 +31,7 @@ from bmask_slam.calibration.adoption import (
     format_found,
     judged,
 )
-from bmask_slam.calibration.camera_check import sure_registration, with_sure_delay
+from bmask_slam.calibration.edge_delay import sure_registration, with_sure_delay
 from bmask_slam.calibration.edge_scores import edge_scores
 from bmask_slam.calibration.keyframe_motions import (
     depth_change_between,

@@ -23,14 +23,7 @@ from bmask_slam.calibration.adoption import (
     format_found,
     judged,
 )
-from bmask_slam.calibration.camera_check import (
-    LARGE_DELAY_S,
-    MAX_DELAY_S,
-    SURE_DELAY_S,
-    delay_warning,
-    sure_registration,
-    with_sure_delay,
-)
+from bmask_slam.calibration.edge_delay import MAX_DELAY_S, EdgeDelay, sure_registration
 from bmask_slam.calibration.edge_scores import FrameEdges, scores_of
 from bmask_slam.calibration.keyframe_depth import KeptDepths, KeyframeDepth, KeyframeImages
 from bmask_slam.calibration.keyframe_motions import keyframe_motions
@@ -112,8 +105,7 @@ class CalibrationServer:
         self._depths: dict[int, KeyframeDepth] = {}
         self._edges: dict[int, FrameEdges] = {}
         self._state, self._looks = SelfCalibration(setup.camera, setup.camera), 0
-        self._looks_at_edges = setup.looks_at_edges  # until a delay that they show is used
-        self._registration: Registration | None = None  # of the last look
+        self._delay = EdgeDelay(setup.camera)
 
     def add(self, images: KeyframeImages) -> None:
         """Keep what is needed of a keyframe's images."""
@@ -145,7 +137,7 @@ class CalibrationServer:
             estimate = None
         edges = self._register(run, world)
         by_motion, contradicted = self._by_motion(estimate, edges)
-        state, doubt = self._by_edges(by_motion, edges)
+        state, doubt = self._delay.judge(by_motion, edges)
         if self._lacks_delay(state):
             doubt = _joined(contradicted, doubt) or self._doubt(state, estimate)
         self._state, text = state, _joined(state.text, doubt)
@@ -160,6 +152,11 @@ class CalibrationServer:
             return CameraEstimated(state.camera, motions, text, settled, bent)
         done = state.adopted or state.settled
         return CameraEstimated(None, {}, text, last or (done and clear))
+
+    @property
+    def _looks_at_edges(self) -> bool:
+        """Whether they are kept: until the delay that they show is used."""
+        return self._setup.looks_at_edges and not self._delay.is_used
 
     def _register(self, run: SavedRun, world: WorldMap) -> Registration | None:
         """How depth lies on colour by its edges, with the camera that the run began with.
@@ -189,36 +186,11 @@ class CalibrationServer:
         logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
         state = judged(before, estimate, setup.mode, setup.config, setup.free)
         newly = adopted_parameters(state) - adopted_parameters(before)
-        if edges is None or TIME not in newly or not self._contradict(edges, state.camera):
+        if TIME not in newly or not self._delay.contradicts(edges, state.camera):
             return state, ""
         others = tuple(i for i in setup.free if i != TIME)
         contradicted = format_found(estimate, (TIME,), "edges of depth contradict it, not applied")
         return judged(before, estimate, setup.mode, setup.config, others), contradicted
-
-    def _by_edges(
-        self, state: SelfCalibration, edges: Registration | None
-    ) -> tuple[SelfCalibration, str]:
-        """The state with a delay of depth that its edges show, and the motion does not.
-
-        One that is not surely large is used if the last look showed it too. Also a warning, if they
-        show one that is no right camera's, and is not used.
-        """
-        given, last = self._setup.camera, self._registration
-        self._registration = edges
-        if edges is None or not self._contradict(edges, state.camera):
-            return state, ""
-        confirmed = last is not None and bool(delay_warning(last, given)) and edges.agrees(last)
-        least_s = SURE_DELAY_S if confirmed else LARGE_DELAY_S
-        late = with_sure_delay(state, edges, given.depth_time_offset_s, least_s)
-        if late is None:
-            return state, delay_warning(edges, given)
-        self._looks_at_edges = False
-        return late, ""
-
-    def _contradict(self, edges: Registration, camera: Camera) -> bool:
-        """Whether edges surely show another delay than a camera has, which is no right camera's."""
-        more_s = camera.depth_time_offset_s - self._setup.camera.depth_time_offset_s
-        return bool(delay_warning(replace(edges, delay_s=edges.delay_s - more_s), camera))
 
     def _doubt(self, state: SelfCalibration, estimate: Estimate | None) -> str:
         """A delay that is not sure enough to be adopted beside what was; "" if there is none."""

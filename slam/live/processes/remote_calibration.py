@@ -11,7 +11,7 @@ import logging
 import threading
 from dataclasses import dataclass
 
-from bmask_slam.calibration.camera_check import MAX_DELAY_S
+from bmask_slam.calibration.edge_delay import MAX_DELAY_S
 from bmask_slam.calibration.keyframe_depth import DepthImage, KeyframeImages
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera

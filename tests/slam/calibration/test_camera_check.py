@@ -17,11 +17,9 @@ from bmask_slam.calibration.adoption import SelfCalibration
 from bmask_slam.calibration.camera_check import (
     CameraCheck,
     check_camera,
-    delay_warning,
     depth_warning,
-    sure_registration,
-    with_sure_delay,
 )
+from bmask_slam.calibration.edge_delay import delay_warning, sure_registration, with_sure_delay
 from bmask_slam.calibration.edge_scores import correlation, edge_scores, edges_of
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import plot
