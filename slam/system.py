@@ -71,8 +71,9 @@ class SlamSystem(SavedSystem):
         tracker = Tracker(camera, config.tracking)
         self.map = back_end or Mapper(camera, tracker, config.back_end)
         self.events = self.map.events
-        rules = config.relocalisation, config.mapping.local_map
-        self.camera_tracker = CameraTracker(tracker, self.map, *rules, self.extractor)
+        self.camera_tracker = CameraTracker(
+            tracker, self.map, config.relocalisation, config.mapping.local_map, self.extractor
+        )
         self.moving_objects = MovingObjectFilter(
             camera, config.moving_objects, config.features, self.map, self.camera_tracker
         )
@@ -279,8 +280,14 @@ class SlamSystem(SavedSystem):
             self.camera_tracker.remember(tracked.features, landmark_of, T_world_camera)
             self.camera_tracker.update_motion(tracked.T_world_camera, T_world_camera, ids)
         if not keyframe and tracked.status.by_image:
-            seen = tracked.features, tracked.keypoints, tracked.landmark_ids
-            self.frame_observations.append(frame.timestamp_s, *seen)
-        poses = reference.T_world_camera, T_world_camera
-        self.map.history.append(frame.timestamp_s, reference.id, *poses, tracked.information)
+            self.frame_observations.append(
+                frame.timestamp_s, tracked.features, tracked.keypoints, tracked.landmark_ids
+            )
+        self.map.history.append(
+            frame.timestamp_s,
+            reference.id,
+            reference.T_world_camera,
+            T_world_camera,
+            tracked.information,
+        )
         return T_world_camera

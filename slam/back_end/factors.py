@@ -40,8 +40,7 @@ def observations_of(
     keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints, depth_factor: float = 1.0
 ) -> Observations:
     """The graph's observations of some keypoints of a keyframe."""
-    given = keyframe.id, keyframe.features, keypoints, landmark_ids
-    return observations_in(*given, depth_factor)
+    return observations_in(keyframe.id, keyframe.features, keypoints, landmark_ids, depth_factor)
 
 
 def observations_in(

@@ -10,7 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from bmask_slam.graph.arrays import Floats, Image
+import numpy as np
+
+from bmask_slam.graph.arrays import Arrays, Floats, Image
 from bmask_slam.semantics.segmenters.segmenter import EarlySegmenter, Segmenter
 from bmask_slam.sequences.frame import Frame
 
@@ -18,6 +20,8 @@ LAG = 3
 """Frames after which what another process answers is used: about as long as it needs."""
 DEPTH_STEP = 2
 """Every second pixel of a keyframe's depth image is kept until its masks arrive."""
+MAX_AWAITING = 100
+"""Keyframes whose depth images are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +30,38 @@ class AwaitingKeyframe:
 
     timestamp_s: float
     depth_m: Floats
+
+
+class AwaitingKeyframes(dict[int, AwaitingKeyframe]):
+    """The newest keyframes whose masks have not come, by their ids."""
+
+    def add(self, keyframe_id: int, awaiting: AwaitingKeyframe) -> None:
+        """Add one; the oldest is given up if there are too many."""
+        self[keyframe_id] = awaiting
+        if len(self) > MAX_AWAITING:
+            del self[min(self)]
+
+    def take(self, keyframe_id: int, size: tuple[int, ...]) -> AwaitingKeyframe:
+        """A keyframe, which waits no more; one without a stamp and depths, if it did not."""
+        nothing = AwaitingKeyframe(np.nan, np.full(size, np.nan, np.float32))
+        return self.pop(keyframe_id, nothing)
+
+    def state(self) -> Arrays:
+        """All of them, as named arrays; the depth images, of one size, in one."""
+        return {
+            "waiting": np.array(list(self), np.int64),
+            "waiting_s": np.array([w.timestamp_s for w in self.values()], float),
+            "waiting_shape": np.array([w.depth_m.shape for w in self.values()], np.int64).ravel(),
+            "waiting_depth_m": np.array([w.depth_m for w in self.values()], np.float32).ravel(),
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Go on from a state, which may hold other arrays too."""
+        shape = state["waiting_shape"].reshape(-1, 2)[:1].ravel().tolist() or [0, 0]
+        depths_m = state["waiting_depth_m"].reshape(len(state["waiting"]), *shape)
+        awaiting = map(AwaitingKeyframe, state["waiting_s"].tolist(), depths_m)
+        self.clear()
+        self.update(zip(state["waiting"].tolist(), awaiting, strict=True))
 
 
 def kept_depth(depth_m: Floats) -> Floats:

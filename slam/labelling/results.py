@@ -8,6 +8,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Bytes, Ints
 from bmask_slam.semantics.beliefs.label_store import LabelEstimates
+from bmask_slam.semantics.beliefs.pixel_assignment import PixelAssignment
 from bmask_slam.semantics.beliefs.surface_store import SurfaceEstimates
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.objects.publication import MapObject
@@ -73,3 +74,18 @@ class MapObjects:
     objects: list[MapObject]
     up_world: Array
     floor_m: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedInstances:
+    """The instances of a keyframe in its image and in the map.
+
+    Attributes:
+        assignment: the instance of every pixel.
+        landmark_ids: (N,) landmarks that surely lie on one.
+        instances: (N,) the index of the instance that each lies on.
+    """
+
+    assignment: PixelAssignment
+    landmark_ids: Ints
+    instances: Ints

@@ -15,19 +15,24 @@ from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.labelling.awaited_masks import (
     DEPTH_STEP,
     AwaitingKeyframe,
+    AwaitingKeyframes,
     MaskRequests,
     kept_depth,
 )
 from bmask_slam.labelling.config import SemanticsConfig, above
 from bmask_slam.labelling.landmark_visibility import Observed, observed_by
 from bmask_slam.labelling.landmark_votes import LabelVotes
-from bmask_slam.labelling.results import Attachment, LandmarkLabels, MapObjects
+from bmask_slam.labelling.results import (
+    Attachment,
+    LandmarkLabels,
+    MapObjects,
+    PlacedInstances,
+)
 from bmask_slam.moving.keyframe_masks import KeyframeMasks
 from bmask_slam.semantics.beliefs.class_sizes import read_sizes
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.observation import observation_model
 from bmask_slam.semantics.beliefs.pixel_assignment import (
-    PixelAssignment,
     assign_pixels,
     check_instances,
 )
@@ -46,8 +51,6 @@ from bmask_slam.world.map_editor import MapReader
 
 logger = logging.getLogger(__name__)
 
-MAX_WAITING = 100
-
 
 class SemanticMapper:
     """Segments keyframes; keeps labels and objects of the map, also from masks that come late.
@@ -57,7 +60,7 @@ class SemanticMapper:
     """
 
     _done: set[int]
-    _waiting: dict[int, AwaitingKeyframe]
+    _waiting: AwaitingKeyframes
 
     def __init__(
         self,
@@ -69,6 +72,7 @@ class SemanticMapper:
     ) -> None:
         self._map, self._on_masks = map_reader, on_masks
         self.camera, self.config = camera, config
+        self._size = camera.height, camera.width
         self.segmenter = segmenter or NoSegmenter()
         self._rays = pixel_rays(camera, DEPTH_STEP)
         self._requests = MaskRequests()
@@ -108,10 +112,8 @@ class SemanticMapper:
 
     def await_masks(self, keyframe: Keyframe, depth_m: Floats) -> None:
         """Keep the ``kept_depth`` of a keyframe until its masks arrive."""
-        self._waiting[keyframe.id] = AwaitingKeyframe(keyframe.timestamp_s, depth_m)
+        self._waiting.add(keyframe.id, AwaitingKeyframe(keyframe.timestamp_s, depth_m))
         self._gravity.add(keyframe.id, depth_m, self._rays)
-        if len(self._waiting) > MAX_WAITING:
-            del self._waiting[min(self._waiting)]
 
     def attach(self, keyframe_id: int, instances: Sequence[Instance]) -> Attachment:
         """Use the masks of a keyframe, at any time after it was made, once.
@@ -122,8 +124,7 @@ class SemanticMapper:
         Raises:
             InputError: masks of another size or with labels that are not in the label set.
         """
-        size = (self.camera.height, self.camera.width)
-        check_instances(instances, size, self.names, f"keyframe {keyframe_id}")
+        check_instances(instances, self._size, self.names, f"keyframe {keyframe_id}")
         observed, done = observed_by(keyframe_id, self._map), keyframe_id in self._done
         if observed is None or done:
             refused = "it has its masks already" if done else "it is not in the map"
@@ -131,21 +132,28 @@ class SemanticMapper:
             return Attachment(keyframe_id, len(instances), refused=refused)
         self._done.add(keyframe_id)
         self._gravity.use_side(up_of(instances))
-        nothing = np.full(self._rays.shape[:2], np.nan, np.float32)
-        waiting = self._waiting.pop(keyframe_id, AwaitingKeyframe(np.nan, nothing))
+        waiting = self._waiting.take(keyframe_id, self._rays.shape[:2])
         least, least_of_objects = self.config.least_scores(self.labels.model is not None)
         voting, config = above(instances, least), self.config.votes
-        everything = assign_pixels(voting, waiting.depth_m, size, config, in_boxes=True)
+        everything = assign_pixels(voting, waiting.depth_m, self._size, config, in_boxes=True)
         voted = self._label_votes.vote(keyframe_id, everything, observed, surfaces_of(instances))
         if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
             found = self._placed(above(instances, least_of_objects), waiting.depth_m, observed)
-            self._add_objects((keyframe_id, waiting), found, observed)
+            self._add_objects(keyframe_id, waiting, found, observed)
         if self._on_masks is not None:
             sure = above(instances, self.config.sure_score)
-            assignment, ids, on = self._placed(sure, waiting.depth_m, observed)
-            about = (ids, on, self.labels.appearance(ids))
-            view = (assignment, waiting.depth_m, observed.T_world_camera)
-            self._on_masks(KeyframeMasks(keyframe_id, self.names, *view, *about))
+            placed = self._placed(sure, waiting.depth_m, observed)
+            masks = KeyframeMasks(
+                keyframe_id=keyframe_id,
+                names=self.names,
+                assignment=placed.assignment,
+                depth_m=waiting.depth_m,
+                T_world_camera=observed.T_world_camera,
+                landmark_ids=placed.landmark_ids,
+                instances=placed.instances,
+                label_distributions=self.labels.appearance(placed.landmark_ids),
+            )
+            self._on_masks(masks)
         return Attachment(keyframe_id, len(instances), voted)
 
     def follow_map(self) -> None:
@@ -197,15 +205,11 @@ class SemanticMapper:
 
     def state(self) -> Arrays:
         """All labels and objects, as named arrays."""
-        waiting = list(self._waiting.values())
         return {
             "names": np.array(self.names.names),
             "measured": np.array([self._measured]),
             "done": np.array(sorted(self._done), np.int64),
-            "waiting": np.array(list(self._waiting), np.int64),
-            "waiting_s": np.array([w.timestamp_s for w in waiting], float),
-            "waiting_shape": np.array([w.depth_m.shape for w in waiting], np.int64).ravel(),
-            "waiting_depth_m": np.array([w.depth_m for w in waiting], np.float32).ravel(),
+            **self._waiting.state(),
             **nested(
                 labels=self.labels.state(),
                 votes=self._label_votes.state(),
@@ -237,14 +241,11 @@ class SemanticMapper:
         if votes := part(state, "votes"):
             self._label_votes.restore(votes)
         self._done = set(state["done"].tolist())
-        shape = state["waiting_shape"].reshape(-1, 2)[:1].ravel().tolist() or [0, 0]
-        depths_m = state["waiting_depth_m"].reshape(len(state["waiting"]), *shape)
-        waiting = map(AwaitingKeyframe, state["waiting_s"].tolist(), depths_m)
-        self._waiting = dict(zip(state["waiting"].tolist(), waiting, strict=True))
+        self._waiting.restore(state)
 
     def begin_session(self) -> None:
         """Another recording begins: masks of earlier keyframes are not awaited."""
-        self._waiting, self._requests = {}, MaskRequests()
+        self._waiting, self._requests = AwaitingKeyframes(), MaskRequests()
 
     def _begin(self, names: LabelSet, measured: str) -> None:
         """Begin with empty stores; ``measured`` names what is known of the masks' errors."""
@@ -252,47 +253,46 @@ class SemanticMapper:
         model = observation_model(measured, names)
         self.labels = LabelStore(len(names), self.config.labels, model)
         self.surfaces = SurfaceStore()
-        stores = self.labels, self.surfaces
-        self._label_votes = LabelVotes(self.camera, self.config.votes, self._map, *stores)
+        self._label_votes = LabelVotes(
+            self.camera, self.config.votes, self._map, self.labels, self.surfaces
+        )
         of_objects = LabelStore(len(names), self.config.labels, model, of_objects=True)
         sizes = read_sizes(names)
         self.objects = ObjectMap(self.camera, of_objects, self.config.objects, sizes)
         self._gravity = GravityEstimator(self.camera.up)
-        self._done, self._waiting = set(), {}
+        self._done, self._waiting = set(), AwaitingKeyframes()
 
     def _placed(
         self, instances: Sequence[Instance], depth_m: Floats, observed: Observed
-    ) -> tuple[PixelAssignment, Ints, Ints]:
-        """The instances' pixels, and the landmarks (N,) that are surely on instances (N,)."""
-        size, config = (self.camera.height, self.camera.width), self.config.votes
-        assignment = assign_pixels(instances, depth_m, size, config)
+    ) -> PlacedInstances:
+        config = self.config.votes
+        assignment = assign_pixels(instances, depth_m, self._size, config)
         visible = observed.located(self._map.world)
         votes = vote(assignment, visible.pixels, visible.z_m, len(self.names), config)
         rows, on = votes.rows[votes.sure], votes.instances[votes.sure]
-        return assignment, observed.landmark_ids[rows], on
+        return PlacedInstances(assignment, observed.landmark_ids[rows], on)
 
     def _add_objects(
         self,
-        waited: tuple[int, AwaitingKeyframe],
-        placed: tuple[PixelAssignment, Ints, Ints],
+        keyframe_id: int,
+        waiting: AwaitingKeyframe,
+        placed: PlacedInstances,
         observed: Observed,
     ) -> None:
-        """Fuse a keyframe's ``_placed`` instances into objects, and place its landmarks on them."""
-        assignment, ids, instances = placed
-        keyframe_id, waiting = waited
+        """Fuse a keyframe's instances into objects, and place its landmarks on them."""
         here = self._map.world.in_segment(observed.anchor.segment)
         T_world_camera = observed.T_world_camera
         view = KeyframeView(
-            keyframe_id,
-            waiting.timestamp_s,
-            T_world_camera,
-            waiting.depth_m,
-            self._rays,
-            assignment,
-            {k.id: k.T_world_camera for k in here} | {keyframe_id: T_world_camera},
+            keyframe_id=keyframe_id,
+            timestamp_s=waiting.timestamp_s,
+            T_world_camera=T_world_camera,
+            depth_m=waiting.depth_m,
+            rays=self._rays,
+            assignment=placed.assignment,
+            poses={k.id: k.T_world_camera for k in here} | {keyframe_id: T_world_camera},
         )
         objects = self.objects.add(view)
         if keyframe_id != observed.anchor.id:
             self.objects.points.reanchor(keyframe_id, observed.anchor.id, observed.T_anchor_camera)
-        on = np.append(objects, -1)[instances]
-        self.objects.place_landmarks(ids[on >= 0], on[on >= 0])
+        on = np.append(objects, -1)[placed.instances]
+        self.objects.place_landmarks(placed.landmark_ids[on >= 0], on[on >= 0])

@@ -111,8 +111,10 @@ def play(
 
 def _track(slam: LiveSlam, source: Source, frame: Frame, prepared: Prepared) -> FrameResult:
     """Track a frame; the source goes on with the camera that may have been found meanwhile."""
-    camera, images = slam.camera, (frame.rgb, frame.depth_m)
-    result = slam.track(frame.timestamp_s, *images, prepared, frame.name, frame.depth_lag_s)
+    camera = slam.camera
+    result = slam.track(
+        frame.timestamp_s, frame.rgb, frame.depth_m, prepared, frame.name, frame.depth_lag_s
+    )
     if slam.camera != camera:
         same_size = slam.camera.reduced_by == source.camera.reduced_by
         source.use(slam.camera if same_size else slam.camera.recorded())

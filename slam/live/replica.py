@@ -252,8 +252,15 @@ def _keyframe(keyframe_id: int, delta: WorldDelta, world: WorldMap) -> Keyframe:
     keyframe, row = world.keyframes.get(keyframe_id), delta.rows.get(keyframe_id)
     if keyframe is None:
         assert row is not None and row.features is not None, "a delta of another map"
-        about = (keyframe_id, row.frame_index, row.timestamp_s, 0, np.eye(4), row.features)
-        keyframe = Keyframe(*about, row.landmark_ids)
+        keyframe = Keyframe(
+            id=keyframe_id,
+            frame_index=row.frame_index,
+            timestamp_s=row.timestamp_s,
+            segment=0,
+            T_world_camera=np.eye(4),
+            features=row.features,
+            landmark_ids=row.landmark_ids,
+        )
         world.store_features(keyframe)
     if row is not None:
         rows = np.flatnonzero(keyframe.landmark_ids != row.landmark_ids)

@@ -114,9 +114,16 @@ def start_calibration(
     rules = SelfCalibrationConfig()
     if camera.rolling_shutter_s:
         rules = replace(rules, frames=2 * rules.frames, stretches=rules.stretches - 1)
-    follows = tuple(free), options.pairs
-    setup = CalibrationSetup(camera, config.graph, rules, options.calibrate, *follows)
-    return RemoteCalibration(setup)
+    return RemoteCalibration(
+        CalibrationSetup(
+            camera=camera,
+            graph=config.graph,
+            config=rules,
+            mode=options.calibrate,
+            free=tuple(free),
+            pairs=options.pairs,
+        )
+    )
 
 
 def frames_a_second(most: float) -> FrameOptions:

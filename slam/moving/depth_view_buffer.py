@@ -79,8 +79,9 @@ class DepthViewBuffer:
             parent = map_reader.world.keyframes.get(parent_id)
             if parent is not None and parent.segment == segment:
                 pose = parent.T_world_camera @ T_parent_keyframe @ kept.T_keyframe_camera
-                when = kept.keyframe_id, kept.timestamp_s
-                found.append(PosedView(*when, kept.view, kept.full, pose))
+                found.append(
+                    PosedView(kept.keyframe_id, kept.timestamp_s, kept.view, kept.full, pose)
+                )
         return found
 
     def clear_depth(self, keyframe_id: int, covered: Mask) -> None:

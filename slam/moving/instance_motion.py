@@ -98,10 +98,9 @@ class InstanceMotion:
                 found.append(None)
                 continue
             points_world = transform(masks.T_world_camera, surface.points)
-            rules = self.check, self.min_judged
-            known = (
-                MotionState.STILL if stood[k] else motion_state(points_world, now_s, others, *rules)
-            )
+            known = MotionState.STILL
+            if not stood[k]:
+                known = motion_state(points_world, now_s, others, self.check, self.min_judged)
             found.append(self._sighting(k, surface, masks, known))
         return found
 

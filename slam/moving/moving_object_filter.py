@@ -164,8 +164,9 @@ class MovingObjectFilter:
             self.camera, masks, self.config.check.window_px, self.config.min_judged
         )
         stood_before = self.static_verification.stood(masks, visible_surfaces, recent, now_s)
-        about = masks, visible_surfaces, stood_before
-        sightings = self._instance_motion.sightings(*about, views, now_s)
+        sightings = self._instance_motion.sightings(
+            masks, visible_surfaces, stood_before, views, now_s
+        )
         moving, tracks = self._tracked_instances(masks, sightings, now_s)
         class_is_no_evidence = [
             s is not None and (s.still or (track is not None and track.stood))

@@ -133,8 +133,9 @@ class StaticVerification:
             mask = masks.assignment.owner == k
             removed = _about_to_be_removed(mask, keyframe, world.landmarks, self._border_px)
             points = surface.points[surface.complete]
-            when = keyframe.id, keyframe.timestamp_s
-            pending = PendingMovable(track.id, *when, points, (removed,))
+            pending = PendingMovable(
+                track.id, keyframe.id, keyframe.timestamp_s, points, (removed,)
+            )
             before = [
                 s
                 for s in self.pending

@@ -84,8 +84,9 @@ def serve_map(
         header, saved = read_arrays(state, STATE_FILE)
         camera = read_camera(header, state)
     system = SlamSystem(camera, config, segmenter)
-    about = camera, config.semantics, system.map, segmenter
-    system.semantics = SemanticMapper(*about, on_masks=channel.send)  # what moves: tracking knows
+    system.semantics = SemanticMapper(  # what moves: tracking knows
+        camera, config.semantics, system.map, segmenter, on_masks=channel.send
+    )
     system.events.on_event = channel.send
     if state is not None and saved is not None:
         system.restore(saved, state)
@@ -216,14 +217,15 @@ class MapServer:
             self._deltas.mark_features_known(message.id)
         system = self.system
         if not self._has_reference(message):
-            nowhere = message.id, NO_KEYFRAME, np.eye(4)
-            self.skip_keyframe(LostKeyframe(*nowhere, message.history, message.reserved[1]))
+            history, landmarks = message.history, message.reserved[1]
+            lost = LostKeyframe(message.id, NO_KEYFRAME, np.eye(4), history, landmarks)
+            self.skip_keyframe(lost)
             return
         system.mapper.world.landmarks.reserve(*message.reserved, message.tracked.new_ids)
         self._add_frames(message)
         tracked, segment = self._updated(message)
-        no_images = np.zeros((0, 0, 3), np.uint8), np.zeros((0, 0), np.float32)
-        frame = Frame(message.frame_index, message.timestamp_s, *no_images)
+        no_rgb, no_depth = np.zeros((0, 0, 3), np.uint8), np.zeros((0, 0), np.float32)
+        frame = Frame(message.frame_index, message.timestamp_s, no_rgb, no_depth)
         system.camera_tracker.segment = segment
         system.events.begin_frame(frame.index, frame.timestamp_s)
         _, keyframe = system.insert(frame, tracked, message.local_ids)

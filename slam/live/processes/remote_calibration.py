@@ -79,9 +79,17 @@ class RemoteCalibration:
         self._last = [*self._last[-2:], DepthImage(frame.depth_m.copy(), taken_s)]
         before, pending = self._last[:-1], self._pending
         if pending is not None and len(before) == 2:
-            about = pending.id, pending.rgb, pending.pixels
-            images = before[1], before[0], self._last[-1]
-            self._worker.send(KeyframeImages(*about, *images, pending.lag_s))
+            self._worker.send(
+                KeyframeImages(
+                    id=pending.id,
+                    rgb=pending.rgb,
+                    pixels=pending.pixels,
+                    depth=before[1],
+                    before=before[0],
+                    after=self._last[-1],
+                    lag_s=pending.lag_s,
+                )
+            )
         self._pending = None
         if keyframe is not None and before:
             pixels = keyframe.features.image_pixels
