@@ -179,7 +179,8 @@ class _Film:
         if not len(cloud.first):
             raise InputError(f"{self._run.path}: no depth in the frames; there is nothing to film")
         view = make_view(cloud, poses, up_world, self._size)
-        made_s = self._run.keyframes.timestamps_s
+        frames = self._run.frames
+        made_s = frames.timestamps_s[frames.keyframe_ids >= 0]
         for number, shot in enumerate(self._shots):
             there = [o for o in self._objects if o.first_seen_s <= shot.timestamp_s]
             left, left_names = self._frame(shot, there)

@@ -93,6 +93,19 @@ def test_a_gif_loops_and_has_the_same_bytes_again(run: Path, tmp_path: Path) -> 
     assert again.read_bytes() == path.read_bytes()
 
 
+def test_a_run_that_was_localised_in_a_map_has_a_film_without_keyframes(
+    run: Path, tmp_path: Path
+) -> None:
+    localised = shutil.copytree(run, tmp_path / "run")
+    (localised / "keyframes.txt").write_text("# timestamp_s tx ty tz qx qy qz qw\n")
+    table = [line.split(",") for line in (run / "frames.csv").read_text().splitlines()]
+    at = table[0].index("keyframe")
+    rows = [table[0], *([*row[:at], "", *row[at + 1 :]] for row in table[1:])]
+    (localised / "frames.csv").write_text("".join(",".join(row) + "\n" for row in rows))
+    film = write_film(FilmOptions(localised, tmp_path / "f.gif", None, 1, 5, 200))
+    assert film.stat().st_size > 1000
+
+
 def test_frames_of_a_camera_that_is_mounted_sideways_are_upright(run: Path, tmp_path: Path) -> None:
     """The left half of the film is the frame, turned so that its left side is up."""
     camera, pictures = read_camera(find_sequence(run) / "camera.yaml"), []
