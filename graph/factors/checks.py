@@ -22,12 +22,17 @@ from bmask_slam.graph.factors.graph_estimate import (
     RefusedFactor,
     RelativePoseErrors,
 )
-from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, PosePrior, RelativePose
+from bmask_slam.graph.factors.graph_update import (
+    KERNELS,
+    GraphUpdate,
+    Observations,
+    PosePrior,
+    RelativePose,
+)
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.geometry import inverse, se3_log
 
 OBSERVATION_PROBABILITY = 0.95
-_ROBUST = (None, "huber", "cauchy", "dcs")
 
 
 def chi2_quantile(probability: float, degrees: int | Ints) -> Any:
@@ -117,8 +122,8 @@ def _pose_factor_reason(
     )
     if not symmetric or np.linalg.eigvalsh(covariance)[0] <= 0:
         return RefusalReason.BAD_COVARIANCE
-    if isinstance(factor, RelativePose) and factor.robust not in _ROBUST:
-        raise ValueError(f"RelativePose.robust is {factor.robust!r}; use one of {_ROBUST}")
+    if isinstance(factor, RelativePose) and factor.robust not in (None, *KERNELS):
+        raise ValueError(f"RelativePose.robust is {factor.robust!r}; use None or one of {KERNELS}")
     return None
 
 

@@ -26,6 +26,8 @@ ODOMETRY, GRAVITY, POSITION, PLANAR = "odometry", "gravity", "position", "planar
 """Kinds of relative poses that sensors measure."""
 MARKER, SITE = "marker", "site"
 """Kinds of fiducial markers: one that a keyframe sees; its known pose in the frame of a site."""
+KERNELS = ("huber", "cauchy", "dcs")
+"""Robust kernels of relative poses."""
 PARTIAL = (GRAVITY, POSITION, PLANAR)
 """Kinds that fix a part of a pose only: what they do not measure has a very large sigma."""
 FIRST_FRAME, FRAMES_OF_A_KIND = 1 << 40, 1 << 30
@@ -92,7 +94,7 @@ class RelativePose:
         keyframe_a, keyframe_b: the two ids.
         T_a_b: (4, 4) measurement, ``p_a = T_a_b @ p_b``.
         covariance: (6, 6) of the tangent ``[rotation rad, translation m]`` at b (right side).
-        robust: None, "huber", "cauchy" or "dcs".
+        robust: None, or one of KERNELS.
         kind: where it comes from: LOOP, "dense", what sensors measure; made by the smoother
             itself: MARGINAL, ANCHOR.
     """

@@ -12,7 +12,13 @@ from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError, finite_number, naming, whole_number
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
+from bmask_slam.graph.factors.graph_update import (
+    FIRST_FRAME,
+    KERNELS,
+    Observations,
+    PosePrior,
+    RelativePose,
+)
 from bmask_slam.graph.factors.observability import component_labels
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.g2o.landmark_graphs import (
@@ -61,7 +67,11 @@ class _Notes:
         elif words[0] == "landmarks":
             self.landmark_offset = whole_number(words[1], where)
         elif words[0] == "edge" and len(words) == 3:
-            self.edges[number + 1] = words[1], None if words[2] == "none" else words[2]
+            kind, kernel = words[1:]
+            if kernel not in ("none", *KERNELS):
+                known = ", ".join(("none", *KERNELS))
+                raise InputError(f"{where}: the kernel {kernel[:40]!r}; use one of {known}")
+            self.edges[number + 1] = kind, None if kernel == "none" else kernel
 
 
 def read_landmark_graph(
@@ -107,6 +117,8 @@ def _add_vertices(
         raise InputError(f"{path}:{at}: vertex {both[0]} is there twice; remove one")
     indices_of(views[:, 0], rows[VIEW].lines, keyframe_ids, path)
     indices_of(views[:, 1], rows[VIEW].lines, landmark_ids, path)
+    _check_numbers(rows[POSE], 0, path)
+    _check_numbers(rows[POINT], offset, path)
     poses = poses_of_columns(np.array(rows[POSE].numbers)[keyframe_rows])
     tables.keyframes.insert(keyframe_ids, poses)
     observed = np.isin(landmark_ids, views[:, 1])
@@ -114,6 +126,17 @@ def _add_vertices(
         logger.warning("%s: %d landmarks without observations left out", path, np.sum(~observed))
     points = np.array(rows[POINT].numbers)[landmark_rows]
     tables.landmarks.insert(landmark_ids[observed] - offset, points[observed])
+
+
+def _check_numbers(vertices: Rows, begin: int, path: Path) -> None:
+    """Refuse vertices that are not numbered as ids from ``begin`` on can be."""
+    end = begin + FIRST_FRAME
+    for (number,), line in zip(vertices.ids, vertices.lines, strict=True):
+        if not begin <= number < end:
+            raise InputError(
+                f"{path}:{line}: a vertex {number} of this type, where they are numbered from "
+                f"{begin} to below {end}; number it anew"
+            )
 
 
 def _camera(rows: dict[str, Rows], notes: _Notes, path: Path) -> Camera:

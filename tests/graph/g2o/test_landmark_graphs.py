@@ -248,6 +248,15 @@ BAD = {
     "self": (WHOLE + EDGE.replace("0 1", "1 1", 1), ":10: an edge from vertex 1 to itself"),
     "fix": (WHOLE + "FIX 2\n", ":10: FIX 2, a vertex that is not there"),
     "comment": ("# bmask-slam landmarks many\n" + WHOLE, ":1: 'many' is not a whole number"),
+    "kernel": ("# bmask-slam edge loop tukey\n" + WHOLE, ":1: the kernel 'tukey'; use one of none"),
+    "keyframe number": (
+        WHOLE + f"VERTEX_SE3:QUAT {2**62} {IDENTITY}\n",
+        f":10: a vertex {2**62} of this type, where they are numbered from 0 to below",
+    ),
+    "landmark number": (
+        "# bmask-slam landmarks 3\n" + WHOLE,
+        ":5: a vertex 2 of this type, where they are numbered from 3 to below",
+    ),
     "nothing seen": (CALIBRATION + POSES + POINTS, "no EDGE_PROJECT_DISPARITY line"),
 }
 
