@@ -15,8 +15,21 @@ from bmask_slam.graph.arrays import Array, Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
-from bmask_slam.graph.files.array_file import FileKind, Header, fitting, read_arrays, write_arrays
+from bmask_slam.graph.factors.graph_update import (
+    FIRST_FRAME,
+    KERNELS,
+    Observations,
+    PosePrior,
+    RelativePose,
+)
+from bmask_slam.graph.files.array_file import (
+    FileKind,
+    Header,
+    check_like,
+    fitting,
+    read_arrays,
+    write_arrays,
+)
 from bmask_slam.graph.files.json_file import check_json
 from bmask_slam.graph.inertial.tables import read_inertial
 from bmask_slam.graph.smoother.marginalised_storage import (
@@ -42,6 +55,8 @@ _SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "pose_factor_robust": ("pose factor", ()),
     **SHAPES,
 }
+END_OF_IDS = 2 * FIRST_FRAME
+"""All ids of keyframes, reference frames and landmarks are below."""
 
 
 def write_graph(path: Path, tables: FactorTables, camera: Camera) -> None:
@@ -96,7 +111,9 @@ def _measured(factor: RelativePose | PosePrior) -> Array:
 
 
 def _check(arrays: Arrays, path: Path) -> None:
-    """Check that all arrays are there, their shapes, sorted ids, and ids that factors refer to."""
+    """Check that all arrays are there, their types and shapes, sorted ids, ids that factors refer
+    to, and values.
+    """
     counts: dict[str, int] = {}
     for name, (what, shape) in _SHAPES.items():
         array = arrays.get(name)
@@ -122,6 +139,30 @@ def _check(arrays: Arrays, path: Path) -> None:
             unknown = np.setdiff1d(arrays[name], arrays[ids])
             if len(unknown):
                 raise InputError(f"{path}: {name} has unknown id {unknown[0]}; save it again")
+    example = graph_arrays(FactorTables())
+    check_like({name: arrays[name] for name in example}, example, path)
+    if name := _impossible(arrays):
+        raise InputError(f"{path}: array {name!r} has a value that no graph has; save it again")
+
+
+def _impossible(arrays: Arrays) -> str:
+    """The first array with a value on which GTSAM or numpy would fail; "" if there is none."""
+    for name in ("keyframe_ids", "landmark_ids"):
+        if ((arrays[name] < 0) | (arrays[name] >= END_OF_IDS)).any():
+            return name
+    for name in ("poses_world_camera", "points_world", "pose_factor_T", "pose_factor_covariances"):
+        if not np.isfinite(arrays[name]).all():
+            return name
+    u_left_v, u_right = np.split(arrays["measurements"], [2], axis=1)
+    if not np.isfinite(u_left_v).all() or np.isinf(u_right).any():
+        return "measurements"
+    used = np.isfinite(arrays["measurements"])  # no disparity without a u_right
+    if not ((arrays["sigmas_px"] > 0) & np.isfinite(arrays["sigmas_px"]))[used].all():
+        return "sigmas_px"
+    if not (np.diagonal(arrays["pose_factor_covariances"], axis1=1, axis2=2) > 0).all():
+        return "pose_factor_covariances"
+    known_kernels = np.isin(arrays["pose_factor_robust"], ["", *KERNELS])
+    return "" if known_kernels.all() else "pose_factor_robust"
 
 
 def factor_tables_of(arrays: Arrays, path: Path) -> FactorTables:

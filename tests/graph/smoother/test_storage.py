@@ -5,6 +5,7 @@ import os
 import pickle
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -142,6 +143,51 @@ def test_inconsistent_contents_are_rejected(
     arrays = saved_arrays(smoother, tmp_path)
     arrays[name] = spoil(arrays[name])
     with pytest.raises(InputError, match=word):
+        load(arrays, tmp_path)
+
+
+def with_first(value: float) -> Callable[[np.ndarray], np.ndarray]:
+    """An array with another value in its first row."""
+
+    def spoil(array: np.ndarray) -> np.ndarray:
+        spoilt = array.copy()
+        spoilt[0] = value
+        return spoilt
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil"),
+    [
+        ("pose_factor_robust", lambda a: np.full(len(a), "tukey")),
+        ("pose_factor_covariances", lambda a: -a),
+        ("pose_factor_covariances", with_first(np.nan)),
+        ("pose_factor_T", with_first(np.inf)),
+        ("poses_world_camera", with_first(np.nan)),
+        ("poses_world_camera", lambda a: a.astype(str)),
+        ("points_world", with_first(np.inf)),
+        ("points_world", lambda a: a.astype(np.float32)),
+        ("measurements", with_first(np.nan)),
+        ("sigmas_px", with_first(0.0)),
+        ("landmark_ids", lambda a: a.astype(float)),
+    ],
+)
+def test_values_that_no_graph_has_are_rejected(
+    smoother: Smoother, tmp_path: Path, name: str, spoil: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    """They would end in an exception of GTSAM or numpy, or in values that are not finite."""
+    arrays = saved_arrays(smoother, tmp_path)
+    arrays[name] = spoil(arrays[name])
+    with pytest.raises(InputError, match=f"graph: array '{name}'"):
+        load(arrays, tmp_path)
+
+
+def test_ids_that_no_graph_has_are_rejected(smoother: Smoother, tmp_path: Path) -> None:
+    arrays = saved_arrays(smoother, tmp_path)
+    for name in ("landmark_ids", "observation_landmark_ids"):
+        arrays[name] = arrays[name] + 2**62
+    with pytest.raises(InputError, match="array 'landmark_ids'"):
         load(arrays, tmp_path)
 
 
