@@ -1,4 +1,4 @@
-"""How sensors are mounted, and the frames and partial covariances of what they measure."""
+"""How sensors are mounted, and the sigmas of what they do not measure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,5 @@ def T_of(mounting: Mounting) -> Array:
     """The pose (4, 4) of a mounting. Raises InputError for one that is none."""
     values = np.array(mounting, float)
     if values.shape != (7,) or not np.isfinite(values).all() or not np.any(values[3:]):
-        raise InputError(
-            f"sensors: mounting {mounting}: give seven numbers, x y z in metres and qx qy qz qw"
-        )
+        raise InputError(f"{mounting}: give seven numbers, x y z in metres and qx qy qz qw")
     return make_pose(rotation_from_quaternion(values[3:]), values[:3])

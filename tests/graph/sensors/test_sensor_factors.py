@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -24,6 +25,9 @@ from bmask_slam.graph.sensors.accelerometer import (
     gravity_factor,
     plumb,
 )
+from bmask_slam.graph.sensors.config import SensorsConfig
+from bmask_slam.graph.sensors.imu import ImuConfig
+from bmask_slam.graph.sensors.markers import MarkersConfig
 from bmask_slam.graph.sensors.mounting import T_of
 from bmask_slam.graph.sensors.odometry import OdometryConfig, motion_between
 from bmask_slam.graph.sensors.planar import PlanarConfig, planar_factor
@@ -278,3 +282,31 @@ def test_a_planar_factor_holds_height_and_tilt_of_the_base_and_nothing_else() ->
     assert off([0, 0, 0, 0, 0, 0.02]) == pytest.approx(4, rel=0.05)
     assert off([0.04, 0, 0, 0, 0, 0]) == pytest.approx(4, rel=0.05)
     assert off([0, -0.04, 0, 0, 0, 0]) == pytest.approx(4, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"imu": ImuConfig(gravity_m_s2=0.0)}, "sensors.imu.gravity_m_s2 = 0: give a positive"),
+        ({"imu": ImuConfig(sigma_accelerometer_bias=np.inf)}, "sensors.imu.sigma_accelerometer_b"),
+        ({"markers": MarkersConfig(size_sigma=0.0)}, "sensors.markers.size_sigma = 0"),
+        (
+            {"accelerometer": AccelerometerConfig(sigma_mounting_rad=-0.1)},
+            "sensors.accelerometer.sigma_mounting_rad = -0.1",
+        ),
+        (
+            {"odometry": OdometryConfig(camera_in_base=(1.0, 0, 0, 0, 0, 0, 0))},
+            r"sensors.odometry.camera_in_base: \(1.0, 0.* give seven numbers",
+        ),
+        (
+            {"markers": MarkersConfig(poses=((7, 0, np.nan, 0, 0, 0, 0, 1),))},
+            "sensors.markers.poses: 7: .* give seven numbers",
+        ),
+    ],
+)
+def test_settings_that_a_sensor_cannot_have_are_refused_at_once(
+    config: dict[str, Any], message: str
+) -> None:
+    """They divided by zero, or ended a run in its middle."""
+    with pytest.raises(InputError, match=message):
+        SensorsConfig(**config)
