@@ -192,7 +192,8 @@ def _covisible(keyframes: Sequence[Keyframe]) -> Ints:
     rows = np.repeat(np.arange(len(keyframes)), [len(k.landmark_ids) for k in keyframes])
     seen = np.concatenate([k.landmark_ids for k in keyframes])
     rows, seen = rows[seen >= 0], seen[seen >= 0]
-    sees = coo_array((np.ones(len(rows), np.int32), (rows, seen))).tocsr()
+    shape = len(keyframes), int(seen.max(initial=-1)) + 1
+    sees = coo_array((np.ones(len(rows), np.int32), (rows, seen)), shape).tocsr()
     shared = (sees @ sees.T).tocoo()
     strong = (shared.data >= MIN_SHARED) & (shared.row < shared.col)
     following = np.arange(len(keyframes) - 1)

@@ -26,7 +26,7 @@ from bmask_slam.graph.geometry import (
 from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.graph.sensors.markers import CORNERS, MarkersConfig
 from bmask_slam.graph.sensors.streams import Measurements
-from bmask_slam.sensing.marker_sightings import WORDS, Verdict
+from bmask_slam.sensing.marker_sightings import WORDS, MarkerSight, Verdict, drift_path
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 
 SIGMA = 0.15 / 525
@@ -310,3 +310,18 @@ def test_the_ids_of_markers_are_those_of_nothing_else() -> None:
     assert marker_of(marker_id(3, 17)) == (3, 17)
     assert marker_of(site_id(0)) is None
     assert marker_of(5) is None
+
+
+def test_drift_is_that_of_the_way_where_no_landmark_is_left() -> None:
+    """Keyframes in a row alone link the map then; it ended in a ValueError."""
+    walk = Walk()
+    for k in range(4):
+        walk.step(pose(k), {})
+    mapper = walk.mapper
+    mapper.prune_landmarks(np.flatnonzero(mapper.world.landmarks.in_map))
+    sight = MarkerSight(mapper.world, mapper.smoother.tables, mapper.loops.noise, {})
+    steps = [
+        inverse(a) @ b for a, b in pairwise(k.T_world_camera for k in mapper.world.in_segment(0))
+    ]
+    expected = sum(np.linalg.norm(step[:3, 3]) for step in steps)
+    assert drift_path(sight, 3, [0])[1] == pytest.approx(expected)
