@@ -164,6 +164,7 @@ class SensorFusion:
             return SensorChanges()
         world, history, tables = owner.world, owner.history, owner.smoother.tables
         self._forget_culled(world)
+        self._update_mounting(world)
         found, sight = SensorChanges(), MarkerSight(world, tables, owner.loops.noise, self._made)
         for segment in sorted({k.segment for k in world.keyframes.values()}):
             given = self.streams, self.config, self._made, self._plumbs, self._first_keyframe
@@ -176,9 +177,15 @@ class SensorFusion:
             found = found.with_more(planar_changes(present, tables, self._made, self.config.planar))
         return found
 
+    def _update_mounting(self, world: WorldMap) -> None:
+        """Estimate how the IMU is mounted, by the segment that grows, if that is due."""
+        present = [k for k in world.keyframes.values() if k.id >= self._first_keyframe]
+        if present:
+            growing = max(present, key=lambda k: k.id).segment
+            self.imu.update([k for k in present if k.segment == growing], self.streams)
+
     def _inertial(self, keyframes: list[Keyframe], tables: FactorTables) -> SensorChanges:
         """Factors of an IMU."""
-        self.imu.update(keyframes, self.streams)
         if (config := self.imu.config) is None:
             return SensorChanges()
         return SensorChanges(

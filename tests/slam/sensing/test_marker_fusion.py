@@ -325,3 +325,19 @@ def test_drift_is_that_of_the_way_where_no_landmark_is_left() -> None:
     ]
     expected = sum(np.linalg.norm(step[:3, 3]) for step in steps)
     assert drift_path(sight, 3, [0])[1] == pytest.approx(expected)
+
+
+def test_an_imus_mounting_is_tried_after_so_many_keyframes_in_two_segments_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By turns, the segments seemed to have grown each time: it was tried twice a keyframe."""
+    walk, tried = Walk(), []
+    walk.mapper.add_measurements(Measurements("imu", np.column_stack([np.arange(9), np.eye(9, 6)])))
+    estimator = walk.mapper.sensors.imu
+    monkeypatch.setattr(estimator, "_estimate", lambda keyframes, _: tried.append(len(keyframes)))
+    for k in range(12):
+        walk.step(pose(k), {})
+    walk.segment, walk.ids = 1, None
+    for k in range(12, 18):
+        walk.step(pose(k), {})
+    assert tried == [5, 10, 1, 6]
