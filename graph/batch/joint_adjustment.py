@@ -62,8 +62,9 @@ class JointResult:
 
     Attributes:
         poses_world_camera: (F, 4, 4) of the frames.
-        cost_before, cost_after: without the outliers of frames.
-        steps: that were taken.
+        cost_before, cost_after: without the outliers of frames, when these were left out after the
+            first steps, and in the end.
+        steps: that were taken, also the first ones.
         outliers: observations of frames that were left out.
     """
 
@@ -149,6 +150,7 @@ class _Problem:
         while not self._step(system):
             self._damping *= 10
             if self._damping > LAST_DAMPING:
+                self._damping = FIRST_DAMPING
                 return False
         self._damping = max(self._damping / 10, FIRST_DAMPING)
         self.steps += 1

@@ -181,6 +181,21 @@ def test_outliers_of_frames_are_left_out() -> None:
     assert apart(found.poses_world_camera, by_gtsam(room, ())[1]) < 1e-3
 
 
+def test_damping_begins_anew_once_outliers_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At an optimum no damping helps; the last one was kept, and the next steps were tiny."""
+    monkeypatch.setattr(joint_adjustment, "LEAST_DECREASE", -1.0)  # until there is no better step
+    costs = []
+    for first_steps in (3, 60):
+        monkeypatch.setattr(joint_adjustment, "MAX_STEPS", (first_steps, 4))
+        room = make_room(noise_px=0.5, mono_share=0.3)
+        frames = frames_of(room)
+        frames.observations.measurements[::9, :2] += 40.0
+        found = adjust_jointly(tables_of(room, KEYFRAMES), frames, CAMERA, EXACT)
+        assert found.outliers > len(frames.observations) // 9
+        costs.append(found.cost_after)
+    assert costs[1] == pytest.approx(costs[0], rel=1e-4)
+
+
 def test_without_frames_it_is_a_bundle_adjustment() -> None:
     room = make_room(noise_px=0.5)
     tables, smoother = tables_of(room, KEYFRAMES), Smoother(CAMERA, EXACT)
