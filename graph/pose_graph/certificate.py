@@ -91,9 +91,9 @@ def certified_rotations(graph: PoseGraph) -> tuple[Array | None, float]:
     try:
         shonan = gtsam.ShonanAveraging3(measurements, parameters)
         values, smallest = shonan.run(initial, 3, MAX_DIMENSION)
-    except RuntimeError:  # no certificate up to that dimension
+        R = np.stack([values.atRot3(k).matrix() for k in range(len(graph.ids))])
+        anchor = int(np.argmax(graph.fixed))
+        poses = poses_of_rotations(graph, graph.poses[anchor, :3, :3] @ R[anchor].T @ R)
+    except RuntimeError:  # no certificate up to that dimension, or no positions for it
         return None, np.nan
-    R = np.stack([values.atRot3(k).matrix() for k in range(len(graph.ids))])
-    anchor = int(np.argmax(graph.fixed))
-    R = graph.poses[anchor, :3, :3] @ R[anchor].T @ R
-    return poses_of_rotations(graph, R), float(smallest)
+    return poses, float(smallest)

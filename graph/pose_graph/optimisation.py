@@ -19,7 +19,7 @@ from bmask_slam.graph.pose_graph.chordal import chordal_poses
 from bmask_slam.graph.pose_graph.factors import edge_chi_squares
 from bmask_slam.graph.pose_graph.gnc import find_wrong_loops
 from bmask_slam.graph.pose_graph.loop_consistency import loop_consistency
-from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, spanning_tree_poses
+from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, is_connected, spanning_tree_poses
 from bmask_slam.graph.pose_graph.solver import Descent, Method, PoseGraphConfig, PoseGraphSolver
 
 RACE_STEPS = 3
@@ -72,7 +72,7 @@ def optimise_pose_graph(
     begin_s = time.perf_counter()
     try:
         result = _optimise(graph, config, PoseGraphSolver(graph, config, progress))
-    except RuntimeError as error:  # GTSAM's exceptions all arrive as this
+    except (RuntimeError, np.linalg.LinAlgError) as error:  # GTSAM's all arrive as the first
         raise InputError(f"the pose graph cannot be solved: {error}") from error
     return replace(result, duration_ms=1e3 * (time.perf_counter() - begin_s))
 
@@ -95,6 +95,8 @@ def _optimise(
     start, raced = _best_start(solver, starts, costs)
     if loops is not None:
         is_outlier = find_wrong_loops(graph, solver, config, loops)
+        if not is_connected(graph.with_edges(~is_outlier)):
+            raise RuntimeError("edges of a finite cost do not connect it")
         solver.weigh(np.where(is_outlier, 0.0, 1.0))
     final = solver.run(config.max_iterations, raced if loops is None else None)
     return PoseGraphResult(

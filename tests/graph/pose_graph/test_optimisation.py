@@ -1,6 +1,7 @@
 """Pose graphs: costs, initial values, optima known exactly, wrong loops found, gauge."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -339,3 +340,37 @@ def public(name: str) -> PoseGraph:
     if not file.is_file():
         pytest.skip(f"{file} is not there: the pose graphs are no part of the repository")
     return read_g2o(file)
+
+
+def test_edges_that_are_too_long_for_numbers_are_no_traceback(tmp_path: Path) -> None:
+    """GNC left a vertex without an edge, with which the certificate then failed in GTSAM."""
+    triangle = " ".join("100" if r == c else "0" for r in range(6) for c in range(r, 6))
+    rest = f"0 0 0.6 0.8 {triangle}"
+    ends = ("20 26 6 0 0", "26 30 4 1e20 0", "30 31 1 1e100 0", "20 30 10 0 0")
+    file = tmp_path / "far.g2o"
+    file.write_text("".join(f"EDGE_SE3:QUAT {end} {rest}\n" for end in ends))
+    with pytest.raises(InputError, match="cannot be solved: edges of a finite cost do not connect"):
+        optimise_pose_graph(read_g2o(file), PoseGraphConfig(method="gnc"))
+
+
+def test_a_singular_prediction_of_a_loop_is_an_input_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of an edge of 1e100 m whose information is 1e-100."""
+
+    def predicted(*_: object) -> np.ndarray:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr("bmask_slam.graph.pose_graph.gnc.predicted_chi2", predicted)
+    graph, _ = with_wrong_loops(ring(60, False, seed=2, sigma=0.01), 5)
+    with pytest.raises(InputError, match="cannot be solved: Singular matrix"):
+        optimise_pose_graph(graph, PoseGraphConfig(method="gnc"))
+
+
+def test_rotations_without_positions_certify_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of edges whose weights differ by a hundred orders of magnitude."""
+
+    def positions(*_: object) -> np.ndarray:
+        raise RuntimeError("Factor is exactly singular")
+
+    monkeypatch.setattr("bmask_slam.graph.pose_graph.certificate.poses_of_rotations", positions)
+    result = optimise_pose_graph(ring(30, False, sigma=0.01))
+    assert certify(result).status == "undecided"
