@@ -195,7 +195,8 @@ def split_rows(array: NDArray[Any], counts: Ints) -> list[NDArray[Any]]:
     How columns of unequal length are read back that were saved one after the other. Unlike
     ``np.split`` it gives no part for no counts. Raises ValueError for another sum.
     """
-    if counts.min(initial=0) < 0 or counts.sum() != len(array):
+    possible = bool(((counts >= 0) & (counts <= len(array))).all())
+    if not possible or counts.sum() != len(array):  # a sum of larger ones may overflow
         raise ValueError(f"{len(array)} rows where {counts.sum()} are counted")
     ends = np.cumsum(counts, dtype=np.int64)
     return [array[end - count : end] for end, count in zip(ends, counts, strict=True)]

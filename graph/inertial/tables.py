@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Arrays, Ints
+from bmask_slam.graph.files.array_file import split_rows
 
 Name = tuple[str, int, int]
 """("imu", keyframe_a, keyframe_b), ("bias", keyframe, 0) or ("gravity", segment, 0)."""
@@ -252,11 +253,13 @@ def read_inertial(arrays: Arrays, keyframes: Ints) -> InertialTables:
     columns, readings = arrays["imu_factors"], arrays["imu_readings"]
     models, counts = arrays["imu_models"], columns[:, 3]
     finite = (readings, models, arrays["imu_states"], arrays["imu_down"])
-    if counts.min() < 1 or counts.sum() != len(readings) or models.shape[1] != _MODEL:
+    longest = counts.max()  # the sum of what is longer than all readings may overflow
+    if not 1 <= counts.min() <= longest <= len(readings) == counts.sum():
         raise ValueError("inertial factors do not fit their readings")
-    if readings.shape[1] != 10 or not all(np.isfinite(a).all() for a in finite):
-        raise ValueError("inertial readings are misshapen or not finite")
-    parts = np.split(readings, np.cumsum(counts)[:-1])
+    misshapen = models.shape[1] != _MODEL or readings.shape[1] != 10
+    if misshapen or not all(np.isfinite(a).all() for a in finite):
+        raise ValueError("inertial readings or models are misshapen or not finite")
+    parts = split_rows(readings, counts)
     for (a, b, segment, _), part, numbers in zip(columns.tolist(), parts, models, strict=True):
         tables.factors[a, b] = InertialFactor(a, b, segment, part, ImuModel.of(numbers))
     tables.states = _by_id(arrays["imu_keyframes"], arrays["imu_states"].reshape(-1, STATE))

@@ -31,7 +31,7 @@ from bmask_slam.graph.files.array_file import (
     write_arrays,
 )
 from bmask_slam.graph.files.json_file import check_json
-from bmask_slam.graph.inertial.tables import read_inertial
+from bmask_slam.graph.inertial.tables import example_arrays, read_inertial
 from bmask_slam.graph.smoother.marginalised_storage import (
     SHAPES,
     marginalised_arrays,
@@ -140,7 +140,9 @@ def _check(arrays: Arrays, path: Path) -> None:
             if len(unknown):
                 raise InputError(f"{path}: {name} has unknown id {unknown[0]}; save it again")
     example = graph_arrays(FactorTables())
-    check_like({name: arrays[name] for name in example}, example, path)
+    if "imu_factors" in arrays:
+        example |= example_arrays()
+    check_like({name: a for name, a in arrays.items() if name in example}, example, path)
     if name := _impossible(arrays):
         raise InputError(f"{path}: array {name!r} has a value that no graph has; save it again")
 

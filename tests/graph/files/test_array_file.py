@@ -143,3 +143,6 @@ def test_columns_of_unequal_length_are_read_back() -> None:
     for found, column in zip(split_rows(np.concatenate(columns), counts), columns, strict=True):
         np.testing.assert_array_equal(found, column)
     assert split_rows(np.zeros((0, 3)), np.zeros(0, np.int64)) == []
+    for wrong in ([1, -1], [2, 2], [2**62, 2**62, 2**62, 2**62 + 3]):  # the last sum overflows to 3
+        with pytest.raises(ValueError, match="3 rows where"):
+            split_rows(np.zeros((3, 2)), np.array(wrong))

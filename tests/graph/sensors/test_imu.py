@@ -175,6 +175,10 @@ def test_tables_are_the_same_after_a_file_and_broken_ones_are_refused() -> None:
         read_inertial(arrays, np.array([4, 5]))
     with pytest.raises(ValueError, match="do not fit their readings"):
         read_inertial({**arrays, "imu_readings": readings}, np.array([4, 5, 6]))
+    overflowing = {**arrays, "imu_factors": np.tile(arrays["imu_factors"][:1], (4, 1))}
+    overflowing["imu_factors"][:, 3] = 2**62, 2**62, 2**62, 2**62 + len(arrays["imu_readings"])
+    with pytest.raises(ValueError, match="do not fit their readings"):
+        read_inertial(overflowing, np.array([4, 5, 6]))
 
 
 def test_the_file_has_eurocs_columns_and_nanoseconds(tmp_path: Path) -> None:
