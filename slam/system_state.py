@@ -39,6 +39,8 @@ class SavedSystem(SensorSystem):
         state = checked_state(state, self.state(), path)
         with fitting(path):
             self.mapper.restore(part(state, "mapper"), path)
+            if "mapper.sensors.made" not in state:  # no measurement yet, nor any before
+                self.mapper.sensors.begin_session(int(state["first_keyframe"]))
             self.camera_tracker.restore(part(state, "localiser"))
             self.semantics.restore(part(state, "semantics"), path)
             self.moving_objects.restore(part(state, "dynamics"))

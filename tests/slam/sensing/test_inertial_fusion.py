@@ -144,6 +144,19 @@ def test_how_the_camera_moved_in_an_earlier_recording_is_not_gone_on_with() -> N
     assert system.mapper.world.next_keyframe_id > first
 
 
+def test_a_restored_session_without_measurements_yet_knows_where_it_began() -> None:
+    """Else the stamps of what comes are compared with those of the earlier recording."""
+    system, restored = SlamSystem(CAMERA, CONFIG), SlamSystem(CAMERA, CONFIG)
+    run(system, range(8))
+    system.begin_session()
+    restored.restore(system.state(), Path("run/checkpoint"))
+    rows = readings()
+    for one in (system, restored):
+        one.add_imu(rows[:, 0] - 20.0, rows[:, 1:4], rows[:, 4:])  # this recording was made before
+        assert not one.mapper.sensors.refused
+        assert len(one.mapper.sensors.streams.of("imu")) == len(rows)
+
+
 def test_a_saved_graph_has_the_imu_and_loses_it_with_its_keyframes(
     bridged: tuple[SlamSystem, SlamSystem, list[FrameResult]], tmp_path: Path
 ) -> None:
