@@ -27,6 +27,12 @@ from bmask_slam.graph.sensors.mounting import Mounting, T_of
 from bmask_slam.graph.sensors.streams import SensorStreams
 
 Kernel = Literal["none", "huber", "cauchy", "dcs"]
+"""The settings of a robust kernel; "none": plain Gaussian."""
+
+
+def kernel_of(setting: Kernel) -> str | None:
+    """The kernel of a relative pose by its setting."""
+    return None if setting == "none" else setting
 
 
 @dataclass(frozen=True)
@@ -97,8 +103,6 @@ def motion_between(
     if np.diff(used[:, 0]).max() > config.max_gap_s:
         return None
     stamps_s = np.concatenate([[begin_s], used[1:-1, 0], [end_s]])
-    stamps_s = stamps_s[(stamps_s >= begin_s) & (stamps_s <= end_s)]
-    stamps_s = np.unique(stamps_s)
     T_odom_base = interpolated(used, stamps_s)
     return _of_camera(T_odom_base, stamps_s, config)
 

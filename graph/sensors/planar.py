@@ -11,7 +11,7 @@ from bmask_slam.graph.factors.graph_update import PLANAR, RelativePose
 from bmask_slam.graph.geometry import adjoint, inverse, make_pose
 from bmask_slam.graph.sensors.accelerometer import UP, rotation_between
 from bmask_slam.graph.sensors.mounting import FREE_M, FREE_RAD, Mounting, T_of
-from bmask_slam.graph.sensors.odometry import Kernel
+from bmask_slam.graph.sensors.odometry import Kernel, kernel_of
 
 
 @dataclass(frozen=True)
@@ -49,5 +49,5 @@ def planar_factor(
     sigmas = np.array([tilt, tilt, FREE_RAD, FREE_M, FREE_M, height])
     A = adjoint(inverse(T_base_camera))
     covariance = A @ np.diag(sigmas**2) @ A.T
-    robust = None if config.robust == "none" else config.robust
+    robust = kernel_of(config.robust)
     return RelativePose(*ids, T, (covariance + covariance.T) / 2, robust, PLANAR)

@@ -15,7 +15,7 @@ from bmask_slam.graph.factors.graph_update import POSITION, RelativePose
 from bmask_slam.graph.geometry import adjoint, inverse, make_pose
 from bmask_slam.graph.sensors.accelerometer import UP
 from bmask_slam.graph.sensors.mounting import FREE_RAD, Lever
-from bmask_slam.graph.sensors.odometry import Kernel
+from bmask_slam.graph.sensors.odometry import Kernel, kernel_of
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def position_factor(
     A, sigma_m = adjoint(T_camera_antenna), sigma_of(measured[3:], config)[0]
     covariance = A @ np.diag([FREE_RAD**2] * 3 + [sigma_m**2] * 3) @ A.T
     T = T_reference_antenna @ inverse(T_camera_antenna)
-    robust = None if config.robust == "none" else config.robust
+    robust = kernel_of(config.robust)
     return RelativePose(*ids, T, (covariance + covariance.T) / 2, robust, POSITION)
 
 

@@ -31,6 +31,7 @@ from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.graph.sensors.markers import FoundMarker, MarkerMap, MarkersConfig, SeenCorners
 from bmask_slam.graph.sensors.mounting import T_of
+from bmask_slam.graph.sensors.odometry import kernel_of
 from bmask_slam.graph.sensors.streams import SensorStreams
 from bmask_slam.sensing.marker_sightings import (
     MarkerSight,
@@ -137,7 +138,7 @@ class MarkerFusion:
             return Verdict.NO_SQUARE
         if best.chi2 <= chi2_quantile(NOISE_PROBABILITY, best.degrees):
             scale = 1.0
-        robust = None if self.config.robust == "none" else self.config.robust
+        robust = kernel_of(self.config.robust)
         T, covariance = best.T_marker_camera, scale * best.covariance
         factor = RelativePose(name[0], name[1], T, covariance, robust, MARKER)
         error = np.zeros(6) if expected is None else se3_log(inverse(T) @ expected)
@@ -215,7 +216,7 @@ class MarkerFusion:
             if T_world_site is None:
                 T_world_site = poses[key] @ inverse(T_site_marker)
             sight.made[name] = np.nan
-            robust = None if self.config.robust == "none" else self.config.robust
+            robust = kernel_of(self.config.robust)
             factors.append(RelativePose(site, key, T_site_marker, covariance, robust, SITE))
         if not begins or T_world_site is None:
             return SensorChanges(relative_poses=tuple(factors))

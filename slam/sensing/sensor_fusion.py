@@ -33,7 +33,7 @@ from bmask_slam.graph.inertial.tables import InertialState
 from bmask_slam.graph.sensors.accelerometer import Plumb
 from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.graph.sensors.markers import MarkerMap
-from bmask_slam.graph.sensors.odometry import Motion, motion_between
+from bmask_slam.graph.sensors.odometry import Motion, kernel_of, motion_between
 from bmask_slam.graph.sensors.streams import Measurements, SensorStreams
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.loops.closing import LoopCloser
@@ -201,7 +201,7 @@ class SensorFusion:
     def _odometry(self, keyframes: list[Keyframe]) -> Iterator[RelativePose]:
         """Motion between keyframes in a row."""
         config = self.config.odometry
-        robust = None if config.robust == "none" else config.robust
+        robust = kernel_of(config.robust)
         for a, b in pairwise(keyframes):
             if (name := (a.id, b.id, ODOMETRY)) in self._made:
                 continue
