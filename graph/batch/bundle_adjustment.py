@@ -132,13 +132,13 @@ def adjust(
         reason = str(error).strip().split("\n\n")[0]
         raise InputError(f"the graph cannot be solved: {reason}") from error
     return Adjustment(
-        tuple(adjuster.stages),
-        len(loops),
-        wrong_loops,
-        observations,
-        wrong,
-        dropped,
-        1e3 * (time.perf_counter() - begin_s),
+        stages=tuple(adjuster.stages),
+        loops=len(loops),
+        wrong_loops=wrong_loops,
+        observations=observations,
+        wrong_observations=wrong,
+        dropped_landmarks=dropped,
+        duration_ms=1e3 * (time.perf_counter() - begin_s),
     )
 
 

@@ -164,6 +164,7 @@ def transform_each(T: Array, points: Array) -> Array:
 
 
 def anchor_rms(problem: CalibrationProblem, state: CalibrationState) -> float:
+    """RMS difference in metres of all anchors, positions and distances; NaN without any."""
     r, _ = anchor_terms(problem, state)
     if problem.anchors is None or not len(r):
         return float("nan")

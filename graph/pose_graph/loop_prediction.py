@@ -17,10 +17,11 @@ SEED = 0
 def predicted_chi2(graph: PoseGraph, used: Mask, edges: Ints) -> Array:
     """Chi-squares (A,) of edges against the solution of others, including its uncertainty.
 
-    ``r^T (Sigma + J P J^T)^-1 r`` with r and J the residual and the Jacobian of an edge of
-    ``asked`` (A,), and P the covariance of the graph's poses, which are the optimum of the ``used``
-    edges (M,). To first order it is twice the increase of the optimal cost when that edge alone is
-    added: a right edge stays below its quantile however far the solution has drifted.
+    ``r^T (Sigma + J P J^T)^-1 r`` with r and J the residual and the Jacobian of one of ``edges``
+    (A,), rows of the graph's edges, and P the covariance of the graph's poses, which are the
+    optimum of the ``used`` edges (M,). To first order it is twice the increase of the optimal cost
+    when that edge alone is added: a right edge stays below its quantile however far the solution
+    has drifted.
 
     Raises:
         RuntimeError: the used edges do not determine all poses.

@@ -106,14 +106,14 @@ def estimate_up(
         return None
     mean = _turned(R_world_camera, np.array([m.mean for m in measured]))
     turn = R_world_camera @ np.array([m.turn for m in measured])
-    plain = np.array([m.sigma_rad for m in measured]) ** -2.0
-    up, d = _unit(plain @ mean), np.zeros(3)
+    precision = np.array([m.sigma_rad for m in measured]) ** -2.0
+    up, d = _unit(precision @ mean), np.zeros(3)
     prior = np.eye(3) / config.sigma_mounting_rad**2
     covariance = np.zeros((5, 5))
     for _ in range(_ITERATIONS):
         residual = mean + turn @ d - up
-        large = np.linalg.norm(residual, axis=1) * np.sqrt(plain)
-        weights = plain * np.minimum(1.0, _HUBER / np.maximum(large, 1e-12))
+        large = np.linalg.norm(residual, axis=1) * np.sqrt(precision)
+        weights = precision * np.minimum(1.0, _HUBER / np.maximum(large, 1e-12))
         basis = _tangents(up)
         J = np.concatenate([turn, np.broadcast_to(-basis, (len(turn), 3, 2))], axis=2)
         H = np.einsum("n,nij,nik->jk", weights, J, J)

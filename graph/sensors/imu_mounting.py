@@ -38,7 +38,6 @@ class ImuMounting:
         T_camera_imu: (4, 4); the lever is zero where it is not known.
         sigmas_rad: (3,) of the rotation, in the IMU's frame. lever_sigma_m: the largest.
         delay_s, delay_sigma_s: the IMU's stamps are so much later than the camera's.
-        residual_rad: root mean square of what the turns differ by.
     """
 
     T_camera_imu: Array
@@ -46,7 +45,6 @@ class ImuMounting:
     lever_sigma_m: float
     delay_s: float
     delay_sigma_s: float
-    residual_rad: float
 
 
 def find_mounting(T_world_camera: Array, cut: Cut, config: ImuConfig) -> ImuMounting | None:
@@ -83,9 +81,8 @@ def find_mounting(T_world_camera: Array, cut: Cut, config: ImuConfig) -> ImuMoun
     if final is None:
         return None
     lever, lever_sigma_m = find_lever(T_world_camera, final, X, (bias, config))
-    late_sigma_s, residual_rad = float(sigmas[6]), float(np.sqrt(np.mean(r**2)))
-    place = make_pose(X, lever), sigmas[:3], lever_sigma_m
-    return ImuMounting(*place, delay_s, late_sigma_s, residual_rad)
+    T_camera_imu = make_pose(X, lever)
+    return ImuMounting(T_camera_imu, sigmas[:3], lever_sigma_m, delay_s, float(sigmas[6]))
 
 
 def _normal_equations(r: Array, J: Array) -> tuple[Array, Array]:

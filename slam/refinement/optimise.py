@@ -117,7 +117,7 @@ def adjust_file(
 
 def format_result(result: PoseGraphResult, certificate: Certificate | None = None) -> str:
     """A few lines: the graph, the initial value, costs, outliers, and the certificate."""
-    graph = result.graph
+    graph, outliers = result.graph, f"{result.is_outlier.sum()} edges, left out of the output"
     rows = [
         ("vertices", f"{len(graph.ids)} ({'2-D' if graph.is_planar else '3-D'})"),
         ("edges", f"{len(graph.edges)} ({np.sum(~graph.is_odometry)} between non-consecutive ids)"),
@@ -126,11 +126,10 @@ def format_result(result: PoseGraphResult, certificate: Certificate | None = Non
         ("initial value", result.start),
         ("initial cost", f"{result.initial_cost:.6g}"),
         ("final cost", f"{result.final_cost:.6g}"),
+        *([("outliers", outliers)] if result.method == "gnc" else []),
         ("iterations", str(result.iterations)),
         ("time", f"{result.duration_ms:.0f} ms"),
     ]
-    if result.method == "gnc":
-        rows.insert(7, ("outliers", f"{result.is_outlier.sum()} edges, left out of the output"))
     if certificate is not None:
         rows.append(("certificate", _describe(certificate)))
     return "\n".join(f"{name:15}{value}" for name, value in rows)
