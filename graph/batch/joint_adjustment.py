@@ -169,8 +169,8 @@ class _Problem:
 
     def _cost(self, poses: Array, points: Array, states: gtsam.Values) -> float:
         """Half the sum of squared errors with Huber's kernel; infinite beyond all values."""
-        given, config = (poses[: self._count], points, states), self._config
-        total = self._weight * self.factors.cost(*given)
+        config = self._config
+        total = self._weight * self.factors.cost(poses[: self._count], points, states)
         for rows in _chunks(len(self._pose)):
             squares = self._chi2(rows, poses, points)
             k = np.where(self._stereo[rows], config.huber_stereo, config.huber_mono)
@@ -180,8 +180,9 @@ class _Problem:
 
     def _chi2(self, rows: Ints, poses: Array, points: Array) -> Array:
         """Squared errors (M,) of observations, without the kernel."""
-        given = self._observations.select(rows), poses[self._pose[rows]], points[self._point[rows]]
-        return reprojection(*given, self._camera)[1]
+        observations = self._observations.select(rows)
+        own_poses, own_points = poses[self._pose[rows]], points[self._point[rows]]
+        return reprojection(observations, own_poses, own_points, self._camera)[1]
 
     def _linearised(self) -> _System:
         P, L = len(self.poses), len(self.points)
@@ -189,9 +190,13 @@ class _Problem:
         H_point, g_point = np.zeros((L, 3, 3)), np.zeros((L, 3))
         cross = np.zeros((len(self._pose), 6, 3))
         for rows in _chunks(len(self._pose)):
-            where = self.poses[self._pose[rows]], self.points[self._point[rows]]
-            given = self._observations.select(rows), *where, self._camera, self._config
-            r, J_pose, J_point = linearise(*given)
+            r, J_pose, J_point = linearise(
+                self._observations.select(rows),
+                self.poses[self._pose[rows]],
+                self.points[self._point[rows]],
+                self._camera,
+                self._config,
+            )
             of_poses, of_points = GroupSums(self._pose[rows], P), GroupSums(self._point[rows], L)
             J_pose_T, J_point_T = J_pose.swapaxes(1, 2), J_point.swapaxes(1, 2)
             cross[rows] = J_pose_T @ J_point
@@ -251,8 +256,9 @@ class _System:
         b = -self.g
         b[: 6 * P] += C @ right
         size = len(b), len(b)
-        easier = LinearOperator(size, self._preconditioner(H_pose, inverse_point, H).solve)
-        x, _ = cg(LinearOperator(size, times), b, rtol=CG_TOLERANCE, maxiter=CG_STEPS, M=easier)
+        schur = LinearOperator(size, times)
+        nearby = LinearOperator(size, self._preconditioner(H_pose, inverse_point, H).solve)
+        x, _ = cg(schur, b, rtol=CG_TOLERANCE, maxiter=CG_STEPS, M=nearby)
         poses, states = x[: 6 * P], x[6 * P :]
         shift = -right - (inverse_point @ (C_T @ poses).reshape(L, 3, 1)).ravel()
         return poses.reshape(P, 6), shift.reshape(L, 3), states

@@ -164,8 +164,13 @@ def _camera(rows: dict[str, Rows], notes: _Notes, path: Path) -> Camera:
         if len(notes.camera) != 10:
             return Camera(round(2 * cx + 1), round(2 * cy + 1), fx, fy, cx, cy, **bf)
         width, height, bf_px_m, depth_scale, fps, k1, k2, p1, p2, k3 = notes.camera
-        rest = (k1, k2, p1, p2, k3), depth_scale, fps, bf_px_m
-        return Camera(round(width), round(height), fx, fy, cx, cy, *rest)
+        return Camera(
+            *(round(width), round(height), fx, fy, cx, cy),
+            distortion=(k1, k2, p1, p2, k3),
+            depth_scale=depth_scale,
+            fps=fps,
+            stereo_bf_px_m=bf_px_m,
+        )
 
 
 def _check_parameters(edge: str, parameter: str, rows: dict[str, Rows], path: Path) -> None:
