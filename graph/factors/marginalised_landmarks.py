@@ -75,6 +75,10 @@ class MarginalisedLandmarks:
         for keyframe, landmark in chunk.observations.select(~chunk.is_summary).pairs.tolist():
             _add(self.observers, landmark, keyframe)
 
+    def number_on(self) -> None:
+        """Number further chunks after those that there are, as if all were read from a file."""
+        self.next_number = max(self.chunks, default=-1) + 1
+
     def remove(self, number: int) -> Chunk:
         """Remove a chunk and return it."""
         chunk = self.chunks.pop(number)

@@ -191,6 +191,7 @@ class Smoother:
         So a run that restarts where it saves goes on exactly as one that is loaded from the file.
         """
         self._solver.reset()
+        self._tables.marginalised.number_on()
 
     def state(self) -> Arrays:
         """Graph, values and ids as named arrays; ISAM2 is not among them, see ``restart``."""
@@ -295,6 +296,5 @@ class Smoother:
 
 
 def _check_known(table: ValueTable, ids: Ints) -> None:
-    known = table.contains(ids)
-    if not known.all():
+    if not (known := table.contains(ids)).all():
         raise KeyError(f"not in the graph: {ids[~known].tolist()}")

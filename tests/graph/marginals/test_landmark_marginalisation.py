@@ -326,3 +326,20 @@ def _last_view(landmarks: Array, keyframe: int, until: int) -> Array:
         (observations.keyframe_ids > keyframe) & (observations.keyframe_ids < until)
     ]
     return ~np.isin(landmarks, later)
+
+
+def test_a_run_that_lost_its_newest_group_goes_on_as_one_that_is_loaded(tmp_path: Path) -> None:
+    """The next group gets the same number, which is in the file."""
+    smoother = filled()
+    marginalise_landmarks(smoother, np.arange(10))
+    marginalise_landmarks(smoother, np.arange(10, 14))
+    smoother.update(GraphUpdate(remove_landmarks=np.arange(10, 14)))
+    smoother.save(tmp_path / "graph")
+    smoother.restart()
+    loaded = Smoother.load(tmp_path / "graph")
+    for one in (smoother, loaded):
+        marginalise_landmarks(one, np.arange(20, 30))
+    after, again = smoother.state(), loaded.state()
+    assert after.keys() == again.keys()
+    for name, array in after.items():
+        np.testing.assert_array_equal(array, again[name], name)
