@@ -46,6 +46,7 @@ from bmask_slam.graph.smoother.anchoring import anchor_components
 
 logger = logging.getLogger(__name__)
 
+CAMERA_NUMBERS = 5 + 5
 _FIXED_COVARIANCE = 1e-12 * np.eye(6)  # micrometres, microradians
 
 
@@ -64,6 +65,12 @@ class _Notes:
             return
         if words[0] == "camera":
             self.camera = [finite_number(word, where) for word in words[1:]]
+            if len(self.camera) != CAMERA_NUMBERS:
+                raise InputError(
+                    f"{where}: {len(self.camera)} numbers of the camera, expected "
+                    f"{CAMERA_NUMBERS}: its size, bf, depth scale, rate and distortion; correct or "
+                    "remove the comment"
+                )
         elif words[0] == "landmarks":
             self.landmark_offset = whole_number(words[1], where)
         elif words[0] == "edge" and len(words) == 3:
@@ -161,7 +168,7 @@ def _camera(rows: dict[str, Rows], notes: _Notes, path: Path) -> Camera:
     fx, fy, cx, cy = intrinsics[0].tolist()
     bf = {"stereo_bf_px_m": fx * rows[STEREO].numbers[0][11]} if len(rows[STEREO]) else {}
     with naming(str(path), f"correct {CAMERA} and {MARK} camera"):
-        if len(notes.camera) != 10:
+        if not notes.camera:
             return Camera(round(2 * cx + 1), round(2 * cy + 1), fx, fy, cx, cy, **bf)
         width, height, bf_px_m, depth_scale, fps, k1, k2, p1, p2, k3 = notes.camera
         return Camera(

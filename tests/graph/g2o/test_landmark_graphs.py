@@ -248,6 +248,10 @@ BAD = {
     "self": (WHOLE + EDGE.replace("0 1", "1 1", 1), ":10: an edge from vertex 1 to itself"),
     "fix": (WHOLE + "FIX 2\n", ":10: FIX 2, a vertex that is not there"),
     "comment": ("# bmask-slam landmarks many\n" + WHOLE, ":1: 'many' is not a whole number"),
+    "cut camera": (
+        "# bmask-slam camera 640 480 40 5000\n" + WHOLE,
+        ":1: 4 numbers of the camera, expected 10",
+    ),
     "kernel": ("# bmask-slam edge loop tukey\n" + WHOLE, ":1: the kernel 'tukey'; use one of none"),
     "keyframe number": (
         WHOLE + f"VERTEX_SE3:QUAT {2**62} {IDENTITY}\n",
