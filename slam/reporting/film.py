@@ -173,12 +173,11 @@ class _Film:
     def pictures(self) -> Iterator[Image]:
         """The pictures (H, W, 3), red first."""
         poses = np.stack([shot.T_world_camera for shot in self._shots])
-        up = -poses[:, :3, 1].mean(axis=0)
-        up_world = up / np.linalg.norm(up) if self._up is None else self._up
+        up = -poses[:, :3, 1].mean(axis=0) if self._up is None else self._up
         cloud = make_cloud(self._shots, self._camera, self._dense)
         if not len(cloud.first):
             raise InputError(f"{self._run.path}: no depth in the frames; there is nothing to film")
-        view = make_view(cloud, poses, up_world, self._size)
+        view = make_view(cloud, poses, up / np.linalg.norm(up), self._size)
         frames = self._run.frames
         made_s = frames.timestamps_s[frames.keyframe_ids >= 0]
         for number, shot in enumerate(self._shots):
@@ -186,15 +185,15 @@ class _Film:
             left, left_names = self._frame(shot, there)
             right, right_names = self._map(view, poses[: number + 1], there)
             gap = np.full((self._size[1], GAP_PX, 3), PAPER, np.uint8)
-            picture = np.hstack([left, gap, right])
-            strip = np.full((STRIP_PX, picture.shape[1], 3), PAPER, np.uint8)
-            picture = np.vstack([picture, strip])
+            halves = np.hstack([left, gap, right])
+            strip = np.full((STRIP_PX, halves.shape[1], 3), PAPER, np.uint8)
             count = int((made_s <= shot.timestamp_s).sum())
             time_s = shot.timestamp_s - self._shots[0].timestamp_s
             text = f"frame {shot.index}    {time_s:.1f} s    keyframes: {count}"
             text += f"    objects: {len(there)}" if self._objects else ""
-            halves = (left_names, 0), (right_names, self._size[0] + GAP_PX)
-            yield self._written(picture, halves, text, (number + 1) / len(self._shots))
+            names = (left_names, 0), (right_names, self._size[0] + GAP_PX)
+            done = (number + 1) / len(self._shots)
+            yield self._written(np.vstack([halves, strip]), names, text, done)
 
     def _frame(self, shot: Shot, there: Sequence[SavedObject]) -> tuple[Image, list[_Name]]:
         """The image with the names of the objects that are in it."""
