@@ -26,8 +26,10 @@ def checked_lengths(counts: str | list[int], given: list[int], size: list[int]) 
     if given != size:
         raise ValueError(f"a mask of size {given} in {size}")
     lengths = decoded_lengths(counts) if isinstance(counts, str) else np.array(counts, np.int64)
-    if lengths.sum() != size[0] * size[1] or lengths.min(initial=0) < 0:
-        raise ValueError(f"run lengths that do not add up to {size[0] * size[1]} pixels")
+    pixels = size[0] * size[1]
+    each_fits = lengths.min(initial=0) >= 0 and lengths.max(initial=0) <= pixels  # nor can it wrap
+    if not each_fits or lengths.sum() != pixels:
+        raise ValueError(f"run lengths that do not add up to {pixels} pixels")
     return lengths
 
 

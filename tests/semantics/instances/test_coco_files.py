@@ -185,6 +185,34 @@ def test_compressed_run_lengths_are_decoded(lengths: list[int]) -> None:
     assert decoded_lengths(text).tolist() == (lengths or [1])
 
 
+def compressed(values: list[int]) -> str:
+    """COCO's text of numbers, each of which it holds as it is or as a difference."""
+    text = ""
+    for value in values:
+        left, ends = value, False
+        while not ends:
+            low, left = left & 31, left >> 5
+            ends = left == (-1 if low & 16 else 0)
+            text += chr(48 + low + (0 if ends else 32))
+    return text
+
+
+def test_run_lengths_whose_sum_overflows_are_refused(tmp_path: Path) -> None:
+    """Their sum modulo 2^64 is the image's size; each is far larger than the image."""
+    largest, pixels = (1 << 34) - 1, 120
+    count = next(n for n in range(1 << 16) if largest * (n + 1) * (n + 2) // 2 > (1 << 64) + pixels)
+    rising = [largest * k for k in range(1, count + 1)]
+    share, rest = divmod((1 << 64) + pixels - sum(rising), count)
+    lengths = [0] + [x for y in rising for x in (y, share)]
+    lengths[-1] += rest
+    differences = lengths[:3] + [b - a for a, b in zip(lengths[1:], lengths[3:], strict=False)]
+    text = compressed(differences)
+    assert sum(decoded_lengths(text).tolist()) == (1 << 64) + pixels
+    runs = {"size": [12, 10], "counts": text}
+    (problem,) = read_coco(write(tmp_path / "c.json", [annotation(segmentation=runs)])).problems
+    assert "run lengths that do not add up to 120 pixels" in problem
+
+
 def test_the_real_excerpt() -> None:
     content = read_coco(shared("coco_excerpt/instances.json"))
     assert len(content.images) == 355
