@@ -117,13 +117,13 @@ def _has_possible_size(data: bytes, where: str) -> bool:
         header = PIL.Image.open(io.BytesIO(data), formats=FORMATS)
         (width, height), bytes_each = header.size, len(header.getbands())
         bytes_each *= _BYTES.get(header.mode, 1)
+        if is_png and data[_PNG_BITS] == 16:
+            bytes_each = 2 * len(header.getbands())
     except PIL.Image.DecompressionBombError:
         width, height = struct.unpack(">II", data[_PNG_SIDES]) if is_png else (1 << 20, 1 << 20)
         bytes_each = 1
     except (OSError, ValueError, SyntaxError, OverflowError, struct.error):
         return False
-    if is_png and data[_PNG_BITS] == 16:
-        bytes_each = 2 * len(header.getbands())
     limit = _limit_megapixels()
     if width * height * max(1, bytes_each / 4) > limit * 1e6:
         raise InputError(

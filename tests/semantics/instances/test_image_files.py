@@ -14,14 +14,14 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.image_files import LIMIT, decode_bytes, read_colour, write_image
 
 
-def png_header(width: int, height: int) -> bytes:
+def png_header(width: int, height: int, bits: int = 8) -> bytes:
     """A PNG file of 69 bytes that claims a size, and has no pixels."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         body = kind + data
         return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
 
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, bits, 2, 0, 0, 0)
     parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(b"\0\0\0\0")), chunk(b"IEND", b"")
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
@@ -33,6 +33,11 @@ def test_a_huge_size_is_refused_before_decoding(tmp_path: Path, width: int, heig
     size = f"{width} x {height} pixels"
     with pytest.raises(InputError, match=rf"bomb\.png: {size}, more than 100 megapixels"):
         read_colour(path)
+
+
+def test_a_huge_size_of_sixteen_bits_is_refused_as_well() -> None:
+    with pytest.raises(InputError, match=r"a: 40000 x 40000 pixels, more than 100 megapixels"):
+        decode_bytes(png_header(40_000, 40_000, bits=16), cv2.IMREAD_UNCHANGED, "a")
 
 
 @pytest.mark.parametrize("length", [0x7FFFFFFF, 0xFFFFFFF0, 40])
