@@ -30,7 +30,7 @@ from bmask_slam.semantics.network.config import (
     ImageConfig,
     NetworkConfig,
 )
-from bmask_slam.semantics.network.model import MaskRCNN
+from bmask_slam.semantics.network.model import ROI_LEVELS, MaskRCNN
 from bmask_slam.semantics.weights.checkpoint_names import (
     BATCHES,
     State,
@@ -97,8 +97,7 @@ def load_network(path: Path, labels: LabelSet | None = None) -> TrainedNetwork:
     except ValueError as error:
         raise InputError(f"{path}: no such network ({error}); give other weights") from error
     check_state(path, state, model, _name(config))
-    floats = {k: v.float() if v.is_floating_point() else v for k, v in state.items()}
-    model.load_state_dict(floats, assign=True)
+    model.load_state_dict(single_precision(state), assign=True)
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return TrainedNetwork(model.eval(), labels)
 
@@ -239,7 +238,15 @@ def check_state(path: Path, state: State, model: nn.Module, name: str) -> None:
         for k in sorted(expected.keys() & state.keys())
         if state[k].shape != expected[k].shape
     ]
-    kinds = (("missing", missing), ("not known", extra), ("of another shape", shaped))
+    whole = [
+        f"{k} {state[k].dtype}"
+        for k in sorted(expected.keys() & state.keys())
+        if expected[k].is_floating_point() and not state[k].is_floating_point()
+    ]
+    kinds = (
+        *(("missing", missing), ("not known", extra)),
+        *(("of another shape", shaped), ("no floating-point numbers", whole)),
+    )
     parts = [
         f"{len(names)} {kind}: {', '.join(names[:SHOWN])}{' ...' if len(names) > SHOWN else ''}"
         for kind, names in kinds
@@ -251,12 +258,19 @@ def check_state(path: Path, state: State, model: nn.Module, name: str) -> None:
         )
 
 
+def single_precision(state: State) -> State:
+    """The weights as the networks compute with them; counters stay whole numbers."""
+    return {k: v.float() if v.is_floating_point() else v for k, v in state.items()}
+
+
 def _described(path: Path, metadata: Mapping[str, str]) -> tuple[NetworkConfig, LabelSet]:
     """Configuration and label set from the metadata of a file of this project."""
     cure = "give weights that this version of the program made"
     config = parse_json(metadata["network"], NetworkConfig, f"{path}: its network", cure)
     names = parse_json(metadata.get("labels", ""), list[Name], f"{path}: its labels", cure)
     fault = next((f for f in _faults(asdict(config)) if f), "")
+    if len(config.anchors.sizes_px) != ROI_LEVELS + 1:
+        fault = f"anchors of {len(config.anchors.sizes_px)} sizes, not {ROI_LEVELS + 1}"
     if fault or not names:
         raise InputError(f"{path}: its network has {fault or 'no labels'}; {cure}")
     return config, label_set(names[1:])

@@ -14,7 +14,7 @@ from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.semantics.labels import LabelSet, read_label_set
 from bmask_slam.semantics.network.yolox.mask_scoring import MaskScoringYolox
 from bmask_slam.semantics.network.yolox.network import YoloxNano
-from bmask_slam.semantics.weights.checkpoints import check_state, read_state
+from bmask_slam.semantics.weights.checkpoints import check_state, read_state, single_precision
 
 KIND = "yolox_nano with mask scoring"
 """In the file's metadata."""
@@ -51,7 +51,7 @@ def load_light(path: Path, labels: LabelSet | None = None) -> LightNetwork:
     with torch.device("meta"):
         model = MaskScoringYolox()
     check_state(path, state, model, "the light network")
-    model.load_state_dict(state, assign=True)
+    model.load_state_dict(single_precision(state), assign=True)
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return LightNetwork(model.eval(), labels or read_label_set("coco"))
 

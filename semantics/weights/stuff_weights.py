@@ -12,7 +12,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.semantics.labels import LabelSet, label_set
 from bmask_slam.semantics.network.yolox.stuff import StuffHead
-from bmask_slam.semantics.weights.checkpoints import check_state, read_state
+from bmask_slam.semantics.weights.checkpoints import check_state, read_state, single_precision
 
 KIND = "stuff head for yolox_nano"
 """The first line of the file's metadata, which is one text, so that the same weights give the same
@@ -43,7 +43,7 @@ def load_stuff(path: Path) -> StuffNetwork:
     with torch.device("meta"):
         head = StuffHead(len(labels) - 1)
     check_state(path, state, head, "the head for stuff")
-    head.load_state_dict({k: v.float() for k, v in state.items()}, assign=True)
+    head.load_state_dict(single_precision(state), assign=True)
     head.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return StuffNetwork(head.eval(), labels)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from repository import shared
+from safetensors.torch import save_file
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.data_files import data_path
@@ -21,6 +22,7 @@ from bmask_slam.semantics.segmenters.segmenter_table import (
     labels_of,
     make_segmenter,
 )
+from bmask_slam.semantics.weights.checkpoints import read_state
 from bmask_slam.semantics.weights.light_weights import (
     LightNetwork,
     is_light,
@@ -124,6 +126,17 @@ def test_other_files_are_not_of_this_network(tmp_path: Path, network: LightNetwo
     save_light(other, tmp_path / "other.safetensors")
     with pytest.raises(InputError, match="not the weights of the light network"):
         load_light(tmp_path / "other.safetensors")
+
+
+def test_weights_of_half_precision_are_used_in_single(
+    network: LightNetwork, photograph: np.ndarray, tmp_path: Path
+) -> None:
+    save_light(network, tmp_path / "single.safetensors")
+    state, about = read_state(tmp_path / "single.safetensors")
+    halves = {name: value.half() for name, value in state.items()}
+    save_file(halves, tmp_path / "half.safetensors", about)
+    found = LightSegmenter(load_light(tmp_path / "half.safetensors"), 0.3)
+    assert len(found.segment(photograph, "a.jpg")) > 1
 
 
 def test_the_classes_of_pixels_lie_where_the_pixels_are(

@@ -157,6 +157,10 @@ def change(key: str | None = None, **changes: Tensor) -> Callable[[State], State
             ["roi_heads.box_head.fc7.bias (512,) instead of (1024,)"],
         ),
         (
+            change(**{"rpn.head.bbox_pred.bias": torch.zeros(12, dtype=torch.int8)}),
+            ["1 no floating-point numbers: rpn.head.bbox_pred.bias torch.int8"],
+        ),
+        (
             lambda s: {k: v for k, v in s.items() if "layer4" not in k},
             ["resnet50", "layer4", "..."],
         ),
@@ -236,3 +240,15 @@ def test_a_file_from_before_anchors_were_described(tmp_path: Path) -> None:
     del described["anchors"]
     save_file(state, tmp_path / "old.safetensors", {**metadata, "network": json.dumps(described)})
     assert load_network(tmp_path / "old.safetensors").model.config == config
+
+
+def test_a_network_with_anchors_for_other_levels_is_refused(tmp_path: Path) -> None:
+    """Weights of the same shapes, for which no level would be left over at the first image."""
+    config = NetworkConfig(
+        classes=3, backbone="mobilenet_v2", norm="none", channels=8, box_hidden=8, mask_channels=8
+    )
+    config = replace(config, anchors=replace(config.anchors, sizes_px=(32, 64, 128)))
+    network = TrainedNetwork(MaskRCNN(config).eval(), label_set(["cup", "mouse"]))
+    save_network(network, tmp_path / "three.safetensors")
+    with pytest.raises(InputError, match=r"three\.safetensors: .*anchors of 3 sizes, not 5"):
+        load_network(tmp_path / "three.safetensors")
