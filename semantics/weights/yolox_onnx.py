@@ -25,6 +25,10 @@ TENSOR_SIZE, TENSOR_TYPE, TENSOR_NAME, TENSOR_BYTES = 1, 2, 8, 9
 FLOAT = 1
 """Numbers of the fields, and of the type, in onnx.proto."""
 _VARINT, _FIXED_64, _BYTES, _FIXED_32 = 0, 1, 2, 5
+_VARINT_BYTES = 10
+"""Of the longest number, which has 64 bits."""
+_FOCUS_SHAPE = (16, 12, 3, 3)
+"""Of the published first layer's weights."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ def load_onnx(path: Path) -> YoloxNano:
     with torch.device("meta"):
         model = YoloxNano()
     expected = convolutions(model)
-    if len(found) == len(expected):
+    if len(found) == len(expected) and found[0][0].shape == _FOCUS_SHAPE:
         found[0] = (_with_stride(found[0][0]), found[0][1])
     shapes = [(w.shape, b.shape) for w, b in found]
     if shapes != [(c.weight.shape, c.bias.shape) for c in expected if c.bias is not None]:
@@ -125,13 +129,13 @@ def _fields(content: int | memoryview) -> Iterator[_Field]:
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:
     """A number of seven bits a byte, the lowest first; and where the next field begins."""
-    number = shift = 0
-    while True:
-        byte = message[at]
-        number |= (byte & 0x7F) << shift
-        at, shift = at + 1, shift + 7
+    number = 0
+    for k in range(_VARINT_BYTES):
+        byte = message[at + k]
+        number |= (byte & 0x7F) << (7 * k)
         if byte < 0x80:
-            return number, at
+            return number, at + k + 1
+    raise ValueError("a number that does not end")
 
 
 def _text(value: int | memoryview) -> str:

@@ -13,7 +13,7 @@ from repository import shared
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.labels import label_set, read_label_set
-from bmask_slam.semantics.network.yolox.layers import PooledContext
+from bmask_slam.semantics.network.yolox.layers import PooledContext, convolutions
 from bmask_slam.semantics.network.yolox.network import STRIDES, YoloxNano, decode
 from bmask_slam.semantics.network.yolox.selection import SelectionConfig, select, voted
 from bmask_slam.semantics.weights.yolox_onnx import load_onnx
@@ -141,4 +141,27 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         load_onnx(bad)
     bad.write_bytes(b"\x3a\x00")  # a model with an empty graph
     with pytest.raises(InputError, match="0 convolutions that are not those of YOLOX-Nano"):
+        load_onnx(bad)
+
+
+def onnx_field(number: int, content: bytes) -> bytes:
+    """A field of a Protocol Buffers message, of less than 128 bytes."""
+    return bytes([number << 3 | 2, len(content)]) + content
+
+
+def test_as_many_convolutions_of_other_shapes_are_refused(tmp_path: Path) -> None:
+    weight = b"\x08\x01\x10\x01" + onnx_field(8, b"w") + onnx_field(9, bytes(4))  # one float
+    conv = b"".join(onnx_field(1, name) for name in (b"x", b"w", b"w")) + onnx_field(4, b"Conv")
+    graph = onnx_field(5, weight) + onnx_field(1, conv) * len(convolutions(YoloxNano()))
+    size = bytes([len(graph) & 127 | 128, len(graph) >> 7])
+    bad = tmp_path / "other.onnx"
+    bad.write_bytes(b"\x3a" + size + graph)
+    with pytest.raises(InputError, match="convolutions that are not those of YOLOX-Nano"):
+        load_onnx(bad)
+
+
+def test_a_number_that_does_not_end_takes_no_minutes(tmp_path: Path) -> None:
+    bad = tmp_path / "long.onnx"
+    bad.write_bytes(b"\xff" * 500_000 + b"\x01")
+    with pytest.raises(InputError, match="a number that does not end"):
         load_onnx(bad)
