@@ -47,16 +47,9 @@ def prepare(images: Sequence[Tensor], config: ImageConfig) -> ImageBatch:
     resized = []
     for image in images:
         factor = resize_factor((image.shape[1], image.shape[2]), config)
+        size = [max(int(n * factor), 1) for n in image.shape[1:]]
         normal = ((image - mean) / std)[None]
-        resized.append(
-            F.interpolate(
-                normal,
-                scale_factor=factor,
-                mode="bilinear",
-                recompute_scale_factor=True,
-                align_corners=False,
-            )[0]
-        )
+        resized.append(F.interpolate(normal, size, mode="bilinear", align_corners=False)[0])
     sizes = [(r.shape[1], r.shape[2]) for r in resized]
     height, width = (
         -(-max(size[k] for size in sizes) // MULTIPLE_PX) * MULTIPLE_PX for k in (0, 1)

@@ -90,7 +90,7 @@ class LightSegmenter:
 
     def _seen(self, image: Image, side_px: int) -> tuple[Features, Tensor, Tensor, float]:
         """Features and raw detections of an image (H, W, 3), the input, and the factor to it."""
-        tensor = torch.from_numpy(image).to(self._device).permute(2, 0, 1)
+        tensor = torch.from_numpy(np.ascontiguousarray(image)).to(self._device).permute(2, 0, 1)
         padded, factor = self._model.detector.letterboxed(tensor, side_px)
         features = self._model.detector.features(padded)
         return features, self._model.detector.detections(features), padded, factor

@@ -51,7 +51,8 @@ class NetworkSegmenter:
     def segment(self, image: Image, name: str) -> list[Instance]:
         """Instances in an image (H, W, 3), best mask score first."""
         check_image(image, name)
-        tensor = torch.from_numpy(image).to(self._device).permute(2, 0, 1).float() / 255
+        tensor = torch.from_numpy(np.ascontiguousarray(image)).to(self._device)
+        tensor = tensor.permute(2, 0, 1).float() / 255
         if self._detector is None:
             detections = self._model([tensor], self._min_score)[0]
         else:

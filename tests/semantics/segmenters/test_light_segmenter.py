@@ -62,6 +62,14 @@ def test_instances_lie_in_the_image_best_first(
     assert all(i.distribution.sum() == pytest.approx(1) for i in found)
 
 
+def test_a_view_with_negative_strides_is_an_image(
+    network: LightNetwork, photograph: np.ndarray
+) -> None:
+    segmenter, mirrored = LightSegmenter(network, 0.3), photograph[:, ::-1]
+    found, same = (segmenter.segment(i, "a.jpg") for i in (mirrored, mirrored.copy()))
+    assert [i.mask_score for i in found] == [i.mask_score for i in same] != []
+
+
 def test_a_larger_image_has_the_same_boxes_at_its_scale(
     network: LightNetwork, photograph: np.ndarray
 ) -> None:

@@ -286,6 +286,18 @@ def test_the_network_finds_instances_and_nothing_above_an_impossible_score() -> 
     assert strict.segment(np.zeros((1, 1, 3), np.uint8), "one pixel") == []
 
 
+def test_a_mirrored_view_of_an_array_and_a_line_of_pixels_are_images() -> None:
+    """numpy gives the first negative strides, as to red, green, blue from OpenCV's images."""
+    torch.manual_seed(0)
+    network = NetworkSegmenter(TrainedNetwork(MaskRCNN(TINY).eval(), LABELS), 0.0, device="cpu")
+    image = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)
+    found, same = (network.segment(i, "a") for i in (image[..., ::-1], image[..., ::-1].copy()))
+    assert len(found) > 0
+    for one, other in zip(found, same, strict=True):
+        np.testing.assert_array_equal(one.mask, other.mask)
+    network.segment(np.zeros((1, 4000, 3), np.uint8), "line")
+
+
 def test_an_image_without_any_detection_gives_an_empty_list() -> None:
     torch.manual_seed(0)
     impossible = replace(TINY, detections=DetectionConfig(min_score=1.1))
