@@ -17,6 +17,8 @@ from bmask_slam.semantics.labels import LabelSet
 
 NO_INSTANCE = -1
 _MAD_TO_SIGMA = 1.4826
+_ROUNDING = 1e-3
+"""By so much a probability may be above 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +67,9 @@ def check_instances(
                 f"{name}: label {instance.label} of {len(instance.distribution)}, but the label "
                 f"set has {len(labels)}; give the label set of these masks"
             )
-        finite = np.isfinite(instance.distribution).all()
-        if not finite or not 0 <= instance.mask_score <= 1:
+        p = np.asarray(instance.distribution)
+        possible = ((p >= 0) & (p <= 1 + _ROUNDING)).all()  # False for NaN
+        if not possible or not 0 <= instance.mask_score <= 1:
             raise InputError(
                 f"{name}: mask score {instance.mask_score} or a class probability is not between "
                 "0 and 1; make the masks again"

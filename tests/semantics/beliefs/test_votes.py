@@ -183,6 +183,13 @@ def test_without_depth_and_without_instances() -> None:
     assert len(vote(nothing, np.zeros((0, 2)), np.zeros(0), 4, CONFIG).rows) == 0
 
 
+@pytest.mark.parametrize("logits", [[0.0, 3.1, -2.0, 0.4], [0.0, 0.5, -0.5, 1.0]])
+def test_logits_are_no_probabilities(logits: list[float]) -> None:
+    bad = Instance(CHAIR.mask, CHAIR.box, 1, np.array(logits, np.float32), 0.9, 0.9)
+    with pytest.raises(InputError, match="a class probability is not between 0 and 1"):
+        check_instances([bad], SIZE, LABELS, "keyframe 7")
+
+
 def test_masks_of_another_image_or_label_set_are_refused() -> None:
     small = np.ones((60, 80), bool)
     strange = certain(1, 4)
