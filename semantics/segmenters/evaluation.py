@@ -17,7 +17,7 @@ from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.semantics.instances.coco_files import CocoFile, CocoImage
@@ -87,7 +87,8 @@ def evaluate_segmenter(
     Objects of classes that are not in the segmenter's label set are removed from the truth.
 
     Raises:
-        InputError: the label sets have no class in common.
+        InputError: the label sets have no class in common, or an image is missing, broken or of
+            another size than its annotations.
     """
     numbers = [segmenter.labels.number(name) for name in truth.labels.names]
     if not any(numbers):
@@ -95,8 +96,7 @@ def evaluate_segmenter(
     found: list[_Entry] = []
     of_images = []
     for k, image in enumerate(truth.images, 1):
-        path = folder / image.file_name
-        instances = segmenter.segment(read_colour(path), image.file_name)
+        instances = segmenter.segment(_pixels_of(image, folder), image.file_name)
         of_images.append(_iou_pairs(instances, image, numbers))
         found.extend(_entry(i, k) for i in instances)
         progress(k, len(truth.images))
@@ -110,6 +110,18 @@ def evaluate_segmenter(
     good = pairs[pairs[:, 1] >= MATCH_IOU]
     correlations = _correlation(pairs), _correlation(good)
     return SegmentationResult(curves, *correlations, len(of_images), len(found), pairs)
+
+
+def _pixels_of(annotated: CocoImage, folder: Path) -> Image:
+    """The image (H, W, 3), of the size of its annotations: masks of another would match none."""
+    path = folder / annotated.file_name
+    image = read_colour(path)
+    if image.shape[:2] != (annotated.height, annotated.width):
+        raise InputError(
+            f"{path}: has {image.shape[1]}x{image.shape[0]} pixels, its annotations "
+            f"{annotated.width}x{annotated.height}; give the images that were annotated"
+        )
+    return image
 
 
 def _entry(instance: Instance, image: int) -> _Entry:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import weakref
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -77,6 +78,16 @@ def test_perfect_masks_have_ap_one_and_no_masks_zero(truth: tuple[CocoFile, Path
     assert [c.ap for c in nothing.curves] == [0, 0, 0]
     with pytest.raises(InputError, match="none of the data's classes"):
         evaluate_segmenter(Scripted.__new__(Other), *truth, quiet)
+
+
+def test_images_of_another_size_than_their_annotations_are_refused(
+    truth: tuple[CocoFile, Path],
+) -> None:
+    content, folder = truth
+    (image,) = content.images
+    other = replace(content, images=(replace(image, width=2 * image.width),))
+    with pytest.raises(InputError, match=f"has {image.width}x.* its annotations {2 * image.width}"):
+        evaluate_segmenter(Scripted([]), other, folder, quiet)
 
 
 class Other(Scripted):
