@@ -120,7 +120,7 @@ def _check_names(names: Iterable[str]) -> None:
     """Raise InputError for two that differ in the suffix alone: they would share files."""
     known: dict[str, str] = {}
     for name in names:
-        if (first := known.setdefault(name.rpartition(".")[0], name)) != name:
+        if (first := known.setdefault(str(Path(name).with_suffix("")), name)) != name:
             raise InputError(f"{first} and {name} differ in the suffix alone; rename one of them")
 
 

@@ -193,6 +193,14 @@ def test_images_that_differ_in_the_suffix_alone_are_refused(tmp_path: Path, imag
     assert not (tmp_path / "masks").exists()
 
 
+def test_images_without_a_suffix_have_files_of_their_own(tmp_path: Path, images: list) -> None:
+    named = [(f"day.1/{number}", path) for number, (_, path) in enumerate(images)]
+    options = CacheOptions(tmp_path / "masks", {"name": "x"})
+    assert cache_masks(Drawer(), named, options, quiet).images == len(named) > 1
+    again = CocoSegmenter(tmp_path / "masks" / ANNOTATIONS)
+    assert len(again.segment(np.zeros((40, 60, 3), np.uint8), "day.1/0")) == 2
+
+
 def test_cached_images_are_not_segmented_again(tmp_path: Path, images: list) -> None:
     options = CacheOptions(tmp_path / "masks", {"name": "x"}, overlays=False)
     drawer = Drawer()
