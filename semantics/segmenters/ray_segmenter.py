@@ -72,7 +72,7 @@ class RaySegmenter:
             raise
         except (errors.RayError, ConnectionError, TimeoutError) as error:
             self._kill_actor()
-            reason = str(error).strip().splitlines()[0]
+            reason = str(error).strip().partition("\n")[0] or type(error).__name__
             raise InputError(f"the segmenter on Ray is lost ({reason})") from error
 
     def _start(self) -> Any:

@@ -98,3 +98,17 @@ def test_a_worker_that_cannot_start_reports_the_reason(segmenter, options, folde
     broken = replace(options, masks=folder / "none.json")
     with pytest.raises(InputError, match=r"none\.json"):
         make_segmenter(broken, folder)
+
+
+class Silent(RaySegmenter):
+    """One whose connection ends without a word, as a socket's may."""
+
+    def _start(self) -> None:
+        raise ConnectionResetError
+
+
+def test_an_error_without_a_text_is_reported_by_its_name() -> None:
+    lost = Silent.__new__(Silent)
+    lost._ray, lost._actor = ray, None
+    with pytest.raises(InputError, match=r"Ray is lost \(ConnectionResetError\)"):
+        lost.segment(IMAGE, "a.png")
