@@ -7,11 +7,12 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from bmask_slam.datasets.catalogue import Recording
 from bmask_slam.datasets.unpack import unpack
-from bmask_slam.datasets.web_file import WebFile, download
+from bmask_slam.datasets.web_file import WebFile, download, locked
 from bmask_slam.evaluation.reference import BONN, TRUTH_BODY
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import target_below
@@ -32,6 +33,14 @@ Progress = Callable[[str, int, int], None]
 """Called with the name of the step, the bytes done and all bytes (0: unknown)."""
 
 
+@dataclass(frozen=True)
+class _Archive:
+    """A downloaded archive and its SHA-256."""
+
+    path: Path
+    sha256: str
+
+
 def obtain(
     recording: Recording,
     folder: Path,
@@ -40,9 +49,10 @@ def obtain(
 ) -> Path:
     """The recording's folder, ``folder/SET/SEQUENCE``; downloads it unless it is there already.
 
-    The folder appears when it is complete. The archive's SHA-256 is stored in ``folder/SHA256SUMS``
-    (in the format of ``sha256sum``); if the catalogue has none, a later download must agree with
-    it. Where the archive came from, its size and SHA-256 are in RECEIVED in the recording's folder.
+    The folder appears when it is complete; of processes that ask for it at once, one downloads and
+    unpacks. The archive's SHA-256 is stored in ``folder/SHA256SUMS`` (in the format of
+    ``sha256sum``); if the catalogue has none, a later download must agree with it. Where the
+    archive came from, its size and SHA-256 are in RECEIVED in the recording's folder.
 
     Raises:
         InputError: no connection, a file that is not the one expected, a broken or dangerous
@@ -52,25 +62,32 @@ def obtain(
     place = target_below(folder, recording.name)
     if place.is_dir():
         return place
-    archive = _received(recording, folder, report)
+    with locked(folder):
+        if not place.is_dir():  # another process has obtained it meanwhile
+            archive = _received(recording, folder, report)
+            _unpack_to(place, archive, recording, report)
+            if not keep_archive:
+                archive.path.unlink()
+    return place
+
+
+def _unpack_to(place: Path, archive: _Archive, recording: Recording, report: Progress) -> None:
+    """Unpack and complete a recording; its folder appears when that is done."""
     unpacking = f".{place.name}.unpacking-"
     for killed in place.parent.glob(f"{unpacking}*"):
         remove(killed)
     private = Path(tempfile.mkdtemp(prefix=unpacking, dir=place.parent))
     unpacked = private / place.name
     try:
-        unpack(archive, unpacked, lambda done, total: report("unpack", done, total))
+        unpack(archive.path, unpacked, lambda done, total: report("unpack", done, total))
         root = _completed(unpacked, recording)
-        _write_received(root / RECEIVED, recording, archive, read_sums(folder / SUMS))
+        _write_received(root / RECEIVED, recording, archive)
         os.replace(root, place)
     finally:
         shutil.rmtree(private, ignore_errors=True)
-    if not keep_archive:
-        archive.unlink()
-    return place
 
 
-def _received(recording: Recording, folder: Path, report: Progress) -> Path:
+def _received(recording: Recording, folder: Path, report: Progress) -> _Archive:
     """The archive, downloaded and checked as far as its SHA-256 is known."""
     archive = target_below(folder, recording.archive)
     known = read_sums(folder / SUMS)
@@ -86,7 +103,7 @@ def _received(recording: Recording, folder: Path, report: Progress) -> Path:
             *(recording.name, archive.stat().st_size, found, folder / SUMS),
         )
     write_sums(folder / SUMS, known | {archive.name: found})
-    return archive
+    return _Archive(archive, found)
 
 
 def read_sums(path: Path) -> dict[str, str]:
@@ -106,13 +123,13 @@ def write_sums(path: Path, sums: dict[str, str]) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def _write_received(path: Path, recording: Recording, archive: Path, sums: dict[str, str]) -> None:
+def _write_received(path: Path, recording: Recording, archive: _Archive) -> None:
     """Write what was received, beside the data: it stays with them where they are moved to."""
     check = "that of the catalogue" if recording.sha256 else "not known to the catalogue"
     lines = [
         f"url     {recording.url}",
-        f"bytes   {archive.stat().st_size}",
-        f"sha256  {sums[archive.name]} ({check})",
+        f"bytes   {archive.path.stat().st_size}",
+        f"sha256  {archive.sha256} ({check})",
     ]
     with whole_file(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -76,7 +76,7 @@ def download(file: WebFile, path: Path, progress: Progress | None = None) -> str
     if not file.url.startswith(("https://", "http://")):
         raise InputError(f"{file.url[:100]}: no web address; give one of https")
     path.parent.mkdir(parents=True, exist_ok=True)
-    with _locked(path.parent):
+    with locked(path.parent):
         if path.is_file() and not _difference(file, path):
             return sha256(path)
         part = path.with_name(f"{path.name}.part")
@@ -188,11 +188,19 @@ def _continues(response: http.client.HTTPResponse, begin: int) -> bool:
 
 def _copy(source: IO[bytes], out: IO[bytes], done: int, total: int, progress: Progress) -> int:
     """Copy to the end; returns the bytes in ``out``."""
-    while chunk := source.read(CHUNK_BYTES):
+    while chunk := _next_chunk(source):
         out.write(chunk)
         done += len(chunk)
         progress(done, total)
     return done
+
+
+def _next_chunk(source: IO[bytes]) -> bytes:
+    """The next bytes of a connection, whose errors are then told from those of the disk."""
+    try:
+        return source.read(CHUNK_BYTES)
+    except OSError as error:  # such as a TLS record that is damaged, or a network that went away
+        raise _InterruptedError(str(error) or type(error).__name__) from error
 
 
 def _check_room(file: WebFile, part: Path, total: int) -> None:
@@ -234,7 +242,7 @@ def _size(path: Path) -> int:
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path) -> Iterator[None]:
     """Hold a lock of the folder, where the system has locks."""
     try:
         import fcntl  # noqa: PLC0415 - Unix only

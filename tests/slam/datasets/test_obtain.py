@@ -5,9 +5,12 @@ from __future__ import annotations
 import hashlib
 import io
 import tarfile
+import time
 import zipfile
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +22,7 @@ from bmask_slam.comparison.experiment.experiment_file import read_experiment
 from bmask_slam.datasets import web_file
 from bmask_slam.datasets.catalogue import Recording, find, read_catalogue
 from bmask_slam.datasets.obtain import RECEIVED, SUMS, obtain, read_sums
+from bmask_slam.datasets.unpack import unpack
 from bmask_slam.evaluation.reference import BONN
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.data_files import data_path
@@ -101,6 +105,23 @@ def test_nothing_is_unpacked_through_a_link(server, tmp_path):
     assert (folder.stat().st_mode & 0o777) == (victim.stat().st_mode & 0o777)
     names = sorted(path.name for path in folder.parent.iterdir())
     assert names == [".freiburg1_tiny.unpacking", "freiburg1_tiny"]
+
+
+def test_of_two_that_obtain_a_recording_one_unpacks(server, tmp_path, monkeypatch):
+    """The other would take its half unpacked folder for one of a killed process."""
+    unpacked = []
+
+    def slow(*arguments: Any) -> None:
+        unpacked.append(arguments)
+        time.sleep(0.3)
+        unpack(*arguments)
+
+    monkeypatch.setattr("bmask_slam.datasets.obtain.unpack", slow)
+    recording = Recording("tum/freiburg1_tiny", f"{server.url}/tiny.tgz")
+    with ThreadPoolExecutor(2) as pool:
+        one, other = (pool.submit(obtain, recording, tmp_path) for _ in range(2))
+    assert one.result() == other.result() == tmp_path / "tum" / "freiburg1_tiny"
+    assert len(unpacked) == len(server.requests) == 1
 
 
 def test_the_first_hash_is_kept_and_a_later_file_must_agree(server, tmp_path, caplog):

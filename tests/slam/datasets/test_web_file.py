@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import http.client
 import shutil
+import ssl
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -51,6 +53,22 @@ def test_a_connection_that_ends_early_is_resumed_where_it_ended(server, tmp_path
     server.cut_after, server.cuts = 300_000, 2
     assert download(WebFile(f"{server.url}/file.tgz"), tmp_path / "f") == SHA256
     assert server.requests == ["", "bytes=300000-", "bytes=600000-"]
+
+
+@pytest.mark.parametrize(
+    "error", [ssl.SSLError(1, "bad record mac"), OSError(errno.EHOSTUNREACH, "No route to host")]
+)
+def test_an_error_of_the_connection_is_none_of_the_disk(server, tmp_path, monkeypatch, error):
+    read, failures = http.client.HTTPResponse.read, [error]
+
+    def failing_once(response: http.client.HTTPResponse, amount: int | None = None) -> bytes:
+        if failures:
+            raise failures.pop()
+        return read(response, amount)
+
+    monkeypatch.setattr(http.client.HTTPResponse, "read", failing_once)
+    assert download(WebFile(f"{server.url}/file.tgz"), tmp_path / "f") == SHA256
+    assert len(server.requests) == 2
 
 
 def test_an_interrupted_download_is_resumed_by_the_next_call(server, tmp_path, monkeypatch):
