@@ -23,6 +23,8 @@ USB = Path("/sys/bus/usb/devices")
 DEVICES = Path("/dev/bus/usb")
 USB_2_MBIT = 480
 ASK_S = 60.0
+_ANSWER = "bmask-slam: "
+"""Begins the line with the answer; a driver may write others, before it or as it ends."""
 KNOWN = (
     ("8086", "", "RealSense", "realsense:", "realsense"),
     ("03e7", "", "", "oak:", "oak"),
@@ -103,12 +105,13 @@ def _ask_apart(library: str) -> Asked:
             [sys.executable, "-P", "-m", "bmask_slam.doctor.cameras", library],
             capture_output=True, text=True, timeout=ASK_S, check=False,
         )  # fmt: skip
-        told = json.loads(done.stdout.splitlines()[-1])
     except subprocess.TimeoutExpired:
         return Asked(library, source, error=f"does not answer within {ASK_S:g} s")
-    except (ValueError, IndexError):
+    told = [line for line in done.stdout.splitlines() if line.startswith(_ANSWER)]
+    if not told:
         return Asked(library, source, error=f"its driver ends with status {done.returncode}")
-    return Asked(library, source, tuple(told["found"]), told["error"])
+    answer = json.loads(told[-1].removeprefix(_ANSWER))
+    return Asked(library, source, tuple(answer["found"]), answer["error"])
 
 
 def ask(library: str) -> Asked:
@@ -174,9 +177,10 @@ FINDERS: dict[str, tuple[str, Callable[[Any], list[str]]]] = {
 
 
 def main(library: str) -> None:
-    """Write what a library finds to stdout, as JSON in one line."""
+    """Write what a library finds to stdout, as JSON in one line that begins with _ANSWER."""
     told = ask(library)
-    sys.stdout.write(f"\n{json.dumps({'found': told.found, 'error': told.error})}\n")
+    answer = json.dumps({"found": told.found, "error": told.error})
+    sys.stdout.write(f"\n{_ANSWER}{answer}\n")
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -266,3 +267,14 @@ def test_a_driver_that_ends_the_process_is_an_answer(tmp_path: Path, monkeypatch
     assert cameras.ask_libraries(["pyk4a", "numpy"]) == (
         Asked("pyk4a", "azure:", error="its driver ends with status 3"),
     )
+
+
+@pytest.mark.parametrize("last_words", ["3", "good-bye"])
+def test_what_a_driver_writes_as_it_ends_is_not_the_answer(
+    tmp_path: Path, monkeypatch, last_words: str
+) -> None:
+    driver = "def connected_device_count(): return 1\n"
+    ending = f"import atexit\natexit.register(print, {last_words!r})\n"
+    (tmp_path / "pyk4a.py").write_text(driver + ending)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    assert cameras.ask_libraries(["pyk4a"]) == (Asked("pyk4a", "azure:", ("device 0",)),)
