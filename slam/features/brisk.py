@@ -59,6 +59,8 @@ class FeatureConfig:
             raise InputError(
                 f"layer_shares {list(shares)}: give 1 to {MAX_LAYERS} positive shares of at most 1"
             )
+        if not self.thresholds or self.bucket_px < 1:
+            raise ValueError("thresholds must not be empty, bucket_px at least 1")
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,10 @@ class IndexConfig:
     lists: int = 1024
     probes: int = 16
 
+    def __post_init__(self) -> None:
+        if min(self.query_keypoints, self.lists, self.probes) < 1:
+            raise ValueError("query_keypoints, lists and probes must be at least 1")
+
 
 @dataclass(frozen=True)
 class Votes:

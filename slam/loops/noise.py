@@ -55,6 +55,10 @@ class NoiseConfig:
     alike_odds: float = 10.0
     reach_m: float = 8.0
 
+    def __post_init__(self) -> None:
+        if min(self.prior_loops, self.prior_closings) <= 0:
+            raise ValueError("prior_loops and prior_closings must be positive")
+
 
 @dataclass(frozen=True)
 class Cycles:

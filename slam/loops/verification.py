@@ -56,6 +56,10 @@ class LoopConfig:
     first_distance: int = 110
     first_ratio: float = 0.85
 
+    def __post_init__(self) -> None:
+        if not self.radii_px:
+            raise ValueError("radii_px must not be empty")
+
 
 class NoLoopReason(Enum):
     """Why a candidate was rejected."""

@@ -62,6 +62,10 @@ class ImageMotionConfig:
         default_factory=lambda: PoseOptimisationConfig(final_rounds=1, step_tolerance=1e-3)
     )
 
+    def __post_init__(self) -> None:
+        if self.window_px < 3:  # OpenCV's limit
+            raise ValueError("window_px must be at least 3")
+
 
 @dataclass(frozen=True, eq=False)
 class LastView:

@@ -34,6 +34,12 @@ class PoseOptimisationConfig:
     max_noise_scale: float = 4.0
     min_points: int = 6
 
+    def __post_init__(self) -> None:
+        if min(self.kernel_iterations, self.final_iterations) < 1:
+            raise ValueError("kernel_iterations and final_iterations must be at least 1")
+        if not self.kernel_widths and not self.final_rounds:
+            raise ValueError("there must be kernel_widths or final_rounds")
+
 
 @dataclass(frozen=True)
 class PoseEstimate:

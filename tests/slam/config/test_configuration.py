@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -232,6 +233,25 @@ def test_a_count_below_zero_is_refused() -> None:
         resolve(SystemConfig, None, ["features.max_keypoints=-5"])
     with pytest.raises(InputError, match="relinearize_skip = 0: must be at least 1"):
         resolve(SystemConfig, None, ["graph.relinearize_skip=0"])
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("features.thresholds=[]", "thresholds must not be empty"),
+        ("features.bucket_px=0", "bucket_px at least 1"),
+        ("tracking.pose.kernel_iterations=0", "kernel_iterations and final_iterations must be"),
+        ("tracking.image_motion.window_px=2", "window_px must be at least 3"),
+        ("loops.index.query_keypoints=0", "query_keypoints, lists and probes must be"),
+        ("loops.index.lists=0", "query_keypoints, lists and probes must be"),
+        ("loops.verification.radii_px=[]", "radii_px must not be empty"),
+        ("loops.noise.prior_loops=0", "prior_loops and prior_closings must be positive"),
+    ],
+)
+def test_what_would_end_at_the_first_frame_or_loop_is_refused(override: str, words: str) -> None:
+    group = override.partition("=")[0].rpartition(".")[0]
+    with pytest.raises(InputError, match=rf"^--set {re.escape(override)}: {group}: .*{words}"):
+        resolve(SystemConfig, None, (override,))
 
 
 def test_an_older_file_is_read_with_the_present_names_of_its_settings(tmp_path: Path) -> None:
