@@ -22,7 +22,8 @@ class StopRequest:
     """In its block the first of these signals only sets ``signal``; a second one acts as usual.
 
     Outside the main thread, where Python allows no handlers, ``signal`` is never set. A SIGHUP that
-    the caller ignores, as under nohup, stays ignored.
+    the caller ignores, as under nohup, stays ignored; a handler that is not Python's, of a program
+    that embeds it, stays in place, since it could not be put back.
     """
 
     def __init__(self) -> None:
@@ -32,8 +33,9 @@ class StopRequest:
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
-                is_nohup = number.name == "SIGHUP" and signal.getsignal(number) is signal.SIG_IGN
-                if not is_nohup:
+                present = signal.getsignal(number)  # None: not Python's
+                is_nohup = number.name == "SIGHUP" and present is signal.SIG_IGN
+                if present is not None and not is_nohup:
                     self._previous[number] = signal.signal(number, self._note)
         return self
 
