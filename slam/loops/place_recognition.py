@@ -53,6 +53,16 @@ class PlaceCandidate:
     queries: int
 
 
+@dataclass(frozen=True)
+class _Group:
+    """Keyframes covisible with their best one; its votes, and all that no better group has."""
+
+    members: frozenset[int]
+    best: int
+    votes: float
+    all_votes: float
+
+
 class PlaceRecogniser:
     """Keeps the groups of the last query; the index may be shared with relocalisation."""
 
@@ -101,12 +111,12 @@ class PlaceRecogniser:
         votes = self.index.votes(descriptors, self.excluded(keyframe_id, covisible))
         groups = self._groups(votes, covisible)
         found = [
-            (group, PlaceCandidate(best, votes, total, self._repeats(group) + 1))
-            for group, best, votes, total in groups
+            PlaceCandidate(g.best, g.votes, g.all_votes, self._repeats(g.members) + 1)
+            for g in groups
         ]
-        self._previous = [(group, candidate.queries) for group, candidate in found]
+        self._previous = [(g.members, c.queries) for g, c in zip(groups, found, strict=True)]
         needed = self.config.consistent_queries
-        consistent = [candidate for _, candidate in found if candidate.queries >= needed]
+        consistent = [candidate for candidate in found if candidate.queries >= needed]
         return consistent[: self.config.candidates]
 
     def excluded(self, keyframe_id: int, covisible: Neighbours) -> set[int]:
@@ -114,12 +124,10 @@ class PlaceRecogniser:
         recent = self.index.keyframe_ids[-self.config.recent :] if self.config.recent else []
         return {keyframe_id, *recent, *covisible(keyframe_id)}
 
-    def _groups(
-        self, votes: Votes, covisible: Neighbours
-    ) -> list[tuple[frozenset[int], int, float, float]]:
-        """(members, best member, its votes, all votes), most votes first, each keyframe's once."""
+    def _groups(self, votes: Votes, covisible: Neighbours) -> list[_Group]:
+        """The groups with most votes, best first; each keyframe's votes count once."""
         counts = dict(zip(votes.keyframe_ids.tolist(), votes.scores.tolist(), strict=True))
-        groups: list[tuple[frozenset[int], int, float, float]] = []
+        groups: list[_Group] = []
         used: set[int] = set()
         for best, own in counts.items():  # most votes first
             if own < self.config.min_votes:
@@ -130,10 +138,10 @@ class PlaceRecogniser:
             total = sum(counts.get(member, 0.0) for member in sorted(members - used))
             used |= members
             if members.isdisjoint(self._dismissed):
-                groups.append((members, best, own, total))
-        groups.sort(key=lambda group: (-group[3], group[1]))
-        limit = self.config.group_share * groups[0][3] if groups else 0.0
-        return [group for group in groups if group[3] >= limit]
+                groups.append(_Group(members, best, own, total))
+        groups.sort(key=lambda group: (-group.all_votes, group.best))
+        limit = self.config.group_share * groups[0].all_votes if groups else 0.0
+        return [group for group in groups if group.all_votes >= limit]
 
     def _repeats(self, group: frozenset[int]) -> int:
         """The largest number of consecutive earlier queries that found this group."""

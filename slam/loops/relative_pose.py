@@ -34,10 +34,24 @@ Views = tuple[LoopView, LoopView]
 Pairs = tuple[Ints, Ints]  # keypoint a[k] goes with b[k]
 
 
-def refine_relative_pose(
-    views: Views, pairs: Pairs, T_a_b: Array, camera: Camera
-) -> tuple[Array, Array, Mask, float]:
-    """T_a_b from pairs of keypoints, its covariance, the inliers, and the noise scale.
+@dataclass(frozen=True)
+class RefinedPose:
+    """T_a_b (4, 4) from M pairs of keypoints.
+
+    Attributes:
+        covariance: (6, 6) of the tangent at b, scaled by the noise.
+        inliers: (M,) bool, which pairs agree.
+        noise_scale: ratio of residuals to their sigmas, at least 1.
+    """
+
+    T_a_b: Array
+    covariance: Array
+    inliers: Mask
+    noise_scale: float
+
+
+def refine_relative_pose(views: Views, pairs: Pairs, T_a_b: Array, camera: Camera) -> RefinedPose:
+    """The pose near T_a_b (4, 4) that fits pairs of keypoints best.
 
     Gauss-Newton with Cauchy's kernel on all pairs, then on inliers alone. A pair with points on
     both sides is used in both directions with half the weight.
@@ -54,7 +68,8 @@ def refine_relative_pose(
         H = np.einsum("n,wnia,wnij,wnjb->ab", w, J, W, J)
         g = np.einsum("n,wnia,wnij,wnj->a", w, J, W, r)
         T_a_b = orthonormalised(T_a_b @ se3_exp(-np.linalg.solve(H + 1e-9 * np.eye(6), g)))
-    return T_a_b, np.linalg.inv(H + 1e-9 * np.eye(6)) * scale**2, active, scale
+    covariance = np.linalg.inv(H + 1e-9 * np.eye(6)) * scale**2
+    return RefinedPose(T_a_b, covariance, active, scale)
 
 
 def _linearised(views: Views, pairs: Pairs, T_a_b: Array, camera: Camera) -> tuple[Array, ...]:

@@ -136,20 +136,28 @@ def verify_loop(
     for radius_px in config.radii_px:
         a, b, expected = _guided_pairs(views, T_a_b, camera, radius_px)
         if (found := len(a)) >= config.min_inliers:
-            T_a_b, covariance, inliers, scale = refine_relative_pose(views, (a, b), T_a_b, camera)
-            found = int(inliers.sum())
+            refined = refine_relative_pose(views, (a, b), T_a_b, camera)
+            T_a_b, found = refined.T_a_b, int(refined.inliers.sum())
         if found < config.min_inliers:
             return NoLoop(NoLoopReason.FEW_INLIERS, found, config.min_inliers)
     if found < config.min_share * expected:
         return NoLoop(NoLoopReason.LITTLE_SHARED, found / expected, config.min_share)
     limits = np.repeat([config.max_sigma_rad, config.max_sigma_m], 3)
-    worst = (np.sqrt(np.diagonal(covariance)) / limits).max()
+    worst = (np.sqrt(np.diagonal(refined.covariance)) / limits).max()
     if not worst <= 1.0:
         return NoLoop(NoLoopReason.UNCERTAIN, worst, 1.0)
-    ids = np.stack([view_a.landmark_ids[a], view_b.landmark_ids[b]], axis=1)[inliers]
+    ids = np.stack([view_a.landmark_ids[a], view_b.landmark_ids[b]], axis=1)
+    ids = ids[refined.inliers]
     ids = np.unique(ids[(ids >= 0).all(axis=1) & (ids[:, 0] != ids[:, 1])], axis=0)
-    result = (T_a_b, covariance, found, scale, ids)
-    return LoopConstraint(view_a.keyframe_id, view_b.keyframe_id, *result)
+    return LoopConstraint(
+        view_a.keyframe_id,
+        view_b.keyframe_id,
+        refined.T_a_b,
+        refined.covariance,
+        found,
+        refined.noise_scale,
+        ids,
+    )
 
 
 def align_triples(points_a: Array, points_b: Array) -> Array:
