@@ -76,12 +76,15 @@ def measure_speed(network: bool) -> Speed:
     """Measure in a second or two, with ``network`` in a few more."""
     texture = _texture()
     image = np.ascontiguousarray(texture[:, : CAMERA.width])
-    tracked = _system_ms(texture)
+    features_ms, frame_ms, keyframe_ms, isam2_ms = _system_ms(texture)
     return Speed(
-        _median_ms(_detector(cv2.ORB_create(1000), image), REPEATS),
-        _median_ms(_detector(cv2.BRISK_create(30), image), REPEATS),
-        *tracked,
-        _network_ms(np.repeat(image[..., None], 3, axis=2)) if network else np.nan,
+        orb_ms=_median_ms(_detector(cv2.ORB_create(1000), image), REPEATS),
+        brisk_ms=_median_ms(_detector(cv2.BRISK_create(30), image), REPEATS),
+        features_ms=features_ms,
+        frame_ms=frame_ms,
+        keyframe_ms=keyframe_ms,
+        isam2_ms=isam2_ms,
+        network_ms=_network_ms(np.repeat(image[..., None], 3, axis=2)) if network else np.nan,
     )
 
 
