@@ -98,7 +98,8 @@ def make_segmenter(
     """Make the segmenter of ``options.name`` for the images of a folder.
 
     By default ``options.weights`` must be a path. ``find_weights`` must be picklable for Ray.
-    Images are turned ``upright`` for a network; None: they are.
+    Images are turned ``upright`` for a network; None: they are. On Ray only where the side that is
+    up is known: nothing looks for it.
 
     Raises:
         InputError: an unknown name, or a file or class that is missing or does not fit.
@@ -106,8 +107,8 @@ def make_segmenter(
     found = _made(options, sequence, find_weights)
     if upright is None or not options.is_network:
         return found
-    is_known = options.ray or upright.side
-    return UprightSegmenter(found, upright, None if is_known else _finder(found))
+    looks = not (options.ray or upright.side)  # a robot that sends its images may lack torch
+    return UprightSegmenter(found, upright, _finder(found) if looks else None)
 
 
 def _made(options: SegmenterOptions, sequence: Path, find_weights: FindWeights) -> Segmenter:
