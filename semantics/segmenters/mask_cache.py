@@ -85,7 +85,7 @@ def cache_masks(
 
     Raises:
         InputError: the folder holds masks made with other settings, two images differ in the
-            suffix alone, or no image can be read.
+            suffix alone, or the first image cannot be read: most likely none can.
     """
     _check_names(name for name, _ in files)
     with_surfaces = _check_settings(options)
@@ -101,7 +101,7 @@ def cache_masks(
                 image = read_colour(path)
                 instances = segmenter.segment(image, name)
             except InputError as error:
-                if k == 0:  # most likely all images are like that
+                if k == 0:
                     raise
                 logger.warning("%s; left out", error)
                 broken += 1
