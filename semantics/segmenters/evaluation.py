@@ -108,8 +108,14 @@ def evaluate_segmenter(
     curves = tuple(_average_precision(known, found, *way) for way in ways)
     pairs = np.concatenate(of_images)
     good = pairs[pairs[:, 1] >= MATCH_IOU]
-    correlations = _correlation(pairs), _correlation(good)
-    return SegmentationResult(curves, *correlations, len(of_images), len(found), pairs)
+    return SegmentationResult(
+        curves,
+        iou_correlation=_correlation(pairs),
+        iou_correlation_of_good=_correlation(good),
+        images=len(of_images),
+        instances=len(found),
+        iou_pairs=pairs,
+    )
 
 
 def _pixels_of(annotated: CocoImage, folder: Path) -> Image:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -24,6 +25,23 @@ from bmask_slam.semantics.weights.light_weights import LightNetwork
 from bmask_slam.semantics.weights.stuff_weights import StuffNetwork
 
 SURE_SCORE = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What the network makes of an image.
+
+    Attributes:
+        features: its feature maps.
+        output: (1, P, 85) raw detections.
+        input_size: (height, width) of its input.
+        factor: scale from the image to the input.
+    """
+
+    features: Features
+    output: Tensor
+    input_size: tuple[int, int]
+    factor: float
 
 
 class LightSegmenter:
@@ -68,53 +86,47 @@ class LightSegmenter:
         check_image(image, name)
         size = (image.shape[0], image.shape[1])
         with torch.inference_mode(), one_thread():
-            features, output, padded, factor = self._seen(image, SIDE_PX)
+            seen = self._seen(image, SIDE_PX)
             if self._detector is None:
-                found = self._selected(output[0], padded, factor, size, self._selection)
+                found = self._selected(seen, size, self._selection)
             else:
                 found = self._detector.detect(image, self.labels).to(self._device)
-            logits, ious = self._model.masks(features, [found.boxes * factor])
+            logits, ious = self._model.masks(seen.features, [found.boxes * seen.factor])
             masks = logits.sigmoid()
             every = Detections(found, masks, around(found.boxes), ious.clamp(0, 1))
             instances = as_instances(every, size, self._selection.min_score)
-            return Segmented(instances, self._surfaces(features, output, factor, size))
+            return Segmented(instances, self._surfaces(seen, size))
 
     def evidence(self, image: Image) -> float:
         """The sum of class scores of what is surely in an image (H, W, 3); without masks."""
         check_image(image, "image")
         size = (image.shape[0], image.shape[1])
         with torch.inference_mode(), one_thread():
-            _, output, padded, factor = self._seen(image, max(size))
             sure = SelectionConfig(SURE_SCORE)
-            return float(self._selected(output[0], padded, factor, size, sure).scores.sum())
+            found = self._selected(self._seen(image, max(size)), size, sure)
+            return float(found.scores.sum())
 
-    def _seen(self, image: Image, side_px: int) -> tuple[Features, Tensor, Tensor, float]:
-        """Features and raw detections of an image (H, W, 3), the input, and the factor to it."""
+    def _seen(self, image: Image, side_px: int) -> _Seen:
+        """What the network makes of an image (H, W, 3), its longer side scaled to ``side_px``."""
         tensor = torch.from_numpy(np.ascontiguousarray(image)).to(self._device).permute(2, 0, 1)
         padded, factor = self._model.detector.letterboxed(tensor, side_px)
         features = self._model.detector.features(padded)
-        return features, self._model.detector.detections(features), padded, factor
+        output = self._model.detector.detections(features)
+        return _Seen(features, output, (padded.shape[2], padded.shape[3]), factor)
 
     def _selected(
-        self,
-        output: Tensor,
-        padded: Tensor,
-        factor: float,
-        size: tuple[int, int],
-        selection: SelectionConfig,
+        self, seen: _Seen, size: tuple[int, int], selection: SelectionConfig
     ) -> ClassifiedBoxes:
-        """Boxes in an image of (height, width), of which the input is ``factor`` times as large."""
-        boxes, probabilities = decode(output, (padded.shape[2], padded.shape[3]))
-        return select(boxes / factor, probabilities, size, self.labels, selection)
+        """The detector's boxes in an image of (height, width) ``size``."""
+        boxes, probabilities = decode(seen.output[0], seen.input_size)
+        return select(boxes / seen.factor, probabilities, size, self.labels, selection)
 
-    def _surfaces(
-        self, features: Features, output: Tensor, factor: float, size: tuple[int, int]
-    ) -> SurfaceClasses | None:
+    def _surfaces(self, seen: _Seen, size: tuple[int, int]) -> SurfaceClasses | None:
         """The classes of all pixels; the cells of the input beyond the image are left out."""
         if self._stuff is None:
             return None
-        cell_px = STUFF_STRIDE / factor
+        cell_px = STUFF_STRIDE / seen.factor
         rows, columns = (math.ceil(n / cell_px) for n in size)
-        logits = self._stuff.head(features, output)[0, :, :rows, :columns]
+        logits = self._stuff.head(seen.features, seen.output)[0, :, :rows, :columns]
         p = logits.softmax(dim=0).permute(1, 2, 0).half().cpu().numpy()
         return SurfaceClasses(self._stuff.labels, np.ascontiguousarray(p), cell_px, size)
