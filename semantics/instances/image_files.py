@@ -31,7 +31,8 @@ _PNG_CHUNK = 12
 """Bytes of a PNG's chunk beside its data: length, kind, checksum."""
 _PNG_SIDES = slice(16, 24)
 """Where a PNG has its width and height, followed by how many bits a value has."""
-_PNG_BITS = 24
+_PNG_BITS, _PNG_COLOUR = 24, 25
+_WITH_PALETTE = 3
 _PNG_PIXELS_A_BYTE = 8 * 1032
 """More cannot come from a byte: of one bit each, at the highest ratio of deflate."""
 warnings.filterwarnings("ignore", module=r"PIL\.")  # said here in one line
@@ -87,10 +88,26 @@ def _as_colour(bgr: NDArray, where: str) -> Image:
 
 def decode_image(path: Path, flags: int) -> NDArray:
     """The decoded image. A truncated file is refused; OpenCV would fill the rest with grey."""
+    return decode_bytes(_content(path), flags, str(path))
+
+
+def _content(path: Path) -> bytes:
     cure = "restore it or correct the list"
     if not path.exists():
         raise InputError(f"{path}: no such image; {cure}")
-    return decode_bytes(read_bytes(path, cure), flags, str(path))
+    return read_bytes(path, cure)
+
+
+def decode_labels(path: Path) -> NDArray:
+    """Values (H, W) of a label image; of a PNG with a palette its indices, not their colours."""
+    data = _content(path)
+    values = decode_bytes(data, cv2.IMREAD_UNCHANGED, str(path))
+    if not data.startswith(PNG) or data[_PNG_COLOUR] != _WITH_PALETTE:
+        return values
+    try:
+        return np.asarray(PIL.Image.open(io.BytesIO(data), formats=("PNG",)))
+    except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: its palette cannot be read ({error}); write it again") from error
 
 
 def decode_bytes(data: bytes, flags: int, where: str) -> NDArray:

@@ -6,13 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-import cv2
 import numpy as np
 
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.coco_files import MAX_MASK_BYTES, CocoImage, read_coco
-from bmask_slam.semantics.instances.image_files import decode_image, reduced_labels, reduction
+from bmask_slam.semantics.instances.image_files import decode_labels, reduced_labels, reduction
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.instances.surface_files import read_surfaces, surface_labels
 from bmask_slam.semantics.instances.surfaces import Segmented
@@ -137,7 +136,10 @@ def _instances(image: CocoImage, classes: int) -> list[Instance]:
 
 
 class LabelImageSegmenter:
-    """Reads label PNGs of any tool: one for each image, of its name, with 8 or 16 bits."""
+    """Reads label PNGs of any tool: one for each image, of its name, with 8 or 16 bits.
+
+    Of PNGs with a palette, such as those of Pascal VOC, the indices are the values.
+    """
 
     def __init__(self, folder: Path, labels: LabelSet) -> None:
         self.folder = folder
@@ -151,7 +153,7 @@ class LabelImageSegmenter:
         """
         check_image(image, name)
         path = self._file(name)
-        values, size = decode_image(path, cv2.IMREAD_UNCHANGED), image.shape[:2]
+        values, size = decode_labels(path), image.shape[:2]
         k = reduction(values.shape, size) if values.ndim == 2 else 0
         if not k:
             raise InputError(

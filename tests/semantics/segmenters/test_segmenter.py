@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 import torch
 
@@ -244,6 +245,20 @@ def test_label_images_of_any_tool(tmp_path: Path) -> None:
         LabelImageSegmenter(tmp_path, LABELS).segment(image, "a.png")
     with pytest.raises(InputError, match="no such image"):
         LabelImageSegmenter(tmp_path, LABELS).segment(image, "b.png")
+
+
+@pytest.mark.parametrize("bits", [2, 8])
+def test_the_indices_of_a_label_image_with_a_palette_are_its_values(
+    tmp_path: Path, bits: int
+) -> None:
+    """Tools that write Pascal VOC's format colour their labels so."""
+    values = np.zeros((40, 60), np.uint8)
+    values[2:6, 3:9], values[10:20, 10:20] = 2, 1
+    picture = PIL.Image.fromarray(values, mode="P")
+    picture.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0])
+    picture.save(tmp_path / "a.png", bits=bits)
+    found = LabelImageSegmenter(tmp_path, LABELS).segment(np.zeros((40, 60, 3), np.uint8), "a.png")
+    assert [(i.label, int(i.mask.sum())) for i in found] == [(1, 100), (2, 24)]
 
 
 def test_a_label_image_of_a_thousand_objects_takes_no_gigabytes(
