@@ -180,7 +180,6 @@ def _checked_images(listed: list[_Image], path: Path) -> dict[int, _Image]:
     if not listed:
         raise InputError(f"{path}: there is no image in it; give another file")
     _check_unique([image.id for image in listed], f"{path}: image id")
-    _check_unique([image.file_name for image in listed], f"{path}: image")
     for image in listed:
         check_name(image.file_name, f"{path}: image {image.id}")
         if image.height * image.width > MAX_PIXELS:
@@ -188,6 +187,7 @@ def _checked_images(listed: list[_Image], path: Path) -> dict[int, _Image]:
                 f"{path}: image {image.id} has {image.width} x {image.height} pixels, more than "
                 f"{MAX_PIXELS // 10**6} megapixels; correct its size"
             )
+    _check_unique([Path(image.file_name).as_posix() for image in listed], f"{path}: image")
     return {image.id: image for image in listed}
 
 

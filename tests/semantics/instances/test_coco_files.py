@@ -165,6 +165,15 @@ def test_ids_that_stand_twice_are_refused(tmp_path: Path, listed: str) -> None:
         read_coco(path)
 
 
+def test_an_image_that_is_named_in_two_ways_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "c.json", [annotation()])
+    content = json.loads(path.read_text())
+    content["images"].append({**content["images"][0], "id": 8, "file_name": "./a.png"})
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"image a\.png stands 2 times"):
+        read_coco(path)
+
+
 def test_a_score_that_rounding_put_above_one_is_one(tmp_path: Path) -> None:
     path = write(tmp_path / "c.json", [annotation(score=1.0000001)])
     assert read_coco(path).images[0].objects[0].score == 1.0
