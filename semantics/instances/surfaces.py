@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Bytes, Floats
+from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.labels import LabelSet
 
 Codes = NDArray[np.uint16]
-LEVELS = 255
+LEVELS = MOST_CLASSES = 255
 """Of a probability in the 16 bits of a code; the class is above it."""
 
 
@@ -58,7 +59,15 @@ class SurfaceClasses:
         return np.pad(found, (*missing, (0, 0)), "edge") if np.any(missing) else found
 
     def codes(self) -> Codes:
-        """(h, w) uint16: the likeliest label times 256 plus its probability in 255ths."""
+        """(h, w) uint16: the likeliest label times 256 plus its probability in 255ths.
+
+        Raises:
+            InputError: there are more than 255 classes.
+        """
+        if len(self.labels) - 1 > MOST_CLASSES:
+            raise InputError(
+                f"surfaces: {len(self.labels) - 1} classes; give at most {MOST_CLASSES}"
+            )
         best = self.probabilities.max(axis=2).astype(np.float32)
         label = self.probabilities.argmax(axis=2) + 1
         return (label * (LEVELS + 1) + np.rint(LEVELS * best)).astype(np.uint16)

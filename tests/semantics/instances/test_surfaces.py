@@ -121,3 +121,10 @@ def test_areas_have_their_colours() -> None:
     drawn = draw_surfaces(np.zeros((240, 320, 3), np.uint8), large).astype(int)
     assert (drawn[2, 2] == drawn[2, 300]).all()
     assert np.abs(drawn[2, 2] - drawn[235, 2]).max() > 40
+
+
+def test_more_classes_than_a_code_can_tell_are_refused() -> None:
+    labels = label_set([f"c{k}" for k in range(256)])
+    seen = SurfaceClasses(labels, np.full((1, 1, 256), 1 / 256, np.float16), 8.0, (8, 8))
+    with pytest.raises(InputError, match="256 classes; give at most 255"):
+        seen.codes()
