@@ -37,9 +37,20 @@ def find_weights(name: str, folder: Path | None = None) -> Path:
 
 
 def cache_folder() -> Path:
-    """Folder of downloaded weights: $XDG_CACHE_HOME/bmask-slam, or ~/.cache/bmask-slam."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "bmask-slam"
+    """Folder of downloaded weights: $XDG_CACHE_HOME/bmask-slam, or ~/.cache/bmask-slam.
+
+    Raises:
+        InputError: neither is known, as in a container whose user has no name.
+    """
+    if base := os.environ.get("XDG_CACHE_HOME"):
+        return Path(base) / "bmask-slam"
+    try:
+        return Path.home() / ".cache" / "bmask-slam"
+    except RuntimeError as error:
+        raise InputError(
+            "no folder for downloaded weights is known, since this user has no home; set "
+            "XDG_CACHE_HOME to one"
+        ) from error
 
 
 def fetch(url: str, folder: Path) -> Path:

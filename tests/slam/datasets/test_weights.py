@@ -9,7 +9,13 @@ from pathlib import Path
 import pytest
 from range_server import Served, serve
 
-from bmask_slam.datasets.weights import PUBLISHED, expected_sha256, fetch, find_weights
+from bmask_slam.datasets.weights import (
+    PUBLISHED,
+    cache_folder,
+    expected_sha256,
+    fetch,
+    find_weights,
+)
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 
@@ -68,3 +74,13 @@ def test_a_segmenter_reads_the_weights_that_were_found(
         make_segmenter(options, tmp_path, find_weights)
     with pytest.raises(InputError, match="torchvision:tiny: no such file"):
         make_segmenter(options, tmp_path)
+
+
+def test_a_user_without_a_home_is_told_what_to_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nobody() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", nobody)
+    with pytest.raises(InputError, match="set XDG_CACHE_HOME"):
+        cache_folder()
