@@ -9,9 +9,13 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.graph.arrays import Bytes, Floats, Ints, Mask
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.labels import LabelSet
 
 _COARSE = 4
 """The order compares masks on every fourth pixel in both directions."""
+_ROUNDING = 1e-3
+"""By so much a probability may be above 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +65,34 @@ class Instance:
 
 def _with_mask(packed: PackedMask, rest: tuple) -> Instance:
     return Instance(packed.unpacked(), *rest)
+
+
+def check_instances(
+    instances: Sequence[Instance], size: tuple[int, int], labels: LabelSet, name: str
+) -> None:
+    """Refuse instances of another image size than (height, width) or another label set.
+
+    Raises:
+        InputError: a mask of another size, a label or distribution outside the set.
+    """
+    for instance in instances:
+        if instance.mask.shape != size or instance.mask.dtype != bool:
+            raise InputError(
+                f"{name}: a mask of shape {instance.mask.shape}, {instance.mask.dtype}, but the "
+                f"images have {size}; give masks of these images"
+            )
+        if not 0 < instance.label < len(labels) or len(instance.distribution) != len(labels):
+            raise InputError(
+                f"{name}: label {instance.label} of {len(instance.distribution)}, but the label "
+                f"set has {len(labels)}; give the label set of these masks"
+            )
+        p = np.asarray(instance.distribution)
+        possible = ((p >= 0) & (p <= 1 + _ROUNDING)).all()  # False for NaN
+        if not possible or not 0 <= instance.mask_score <= 1:
+            raise InputError(
+                f"{name}: mask score {instance.mask_score} or a class probability is not between "
+                "0 and 1; make the masks again"
+            )
 
 
 def mask_box(mask: Mask) -> Floats:

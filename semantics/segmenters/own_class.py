@@ -12,7 +12,7 @@ from typing import Any
 
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
-from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.instances.instances import Instance, check_instances
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import Segmenter, check_image
 
@@ -43,7 +43,11 @@ class OwnSegmenter:
         self._inner = inner
 
     def segment(self, image: Image, name: str) -> list[Instance]:
-        """What the object finds. Raises InputError where that is no list of instances."""
+        """What the object finds.
+
+        Raises:
+            InputError: that is no list of instances of this image and of the object's labels.
+        """
         check_image(image, name)
         found = self._inner.segment(image, name)
         if not isinstance(found, list) or not all(isinstance(i, Instance) for i in found):
@@ -51,6 +55,8 @@ class OwnSegmenter:
                 f"segmenter {self.name}: segment() gave {type(found).__name__} for {name}; "
                 "give a list of bmask_slam.semantics.instances.instances.Instance"
             )
+        size = (image.shape[0], image.shape[1])
+        check_instances(found, size, self.labels, f"segmenter {self.name}: {name}")
         return found
 
 

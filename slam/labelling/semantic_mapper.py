@@ -32,14 +32,11 @@ from bmask_slam.moving.keyframe_masks import KeyframeMasks
 from bmask_slam.semantics.beliefs.class_sizes import read_sizes
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.observation import observation_model
-from bmask_slam.semantics.beliefs.pixel_assignment import (
-    assign_pixels,
-    check_instances,
-)
+from bmask_slam.semantics.beliefs.pixel_assignment import assign_pixels
 from bmask_slam.semantics.beliefs.surface_geometry import Ground
 from bmask_slam.semantics.beliefs.surface_store import SurfaceStore
 from bmask_slam.semantics.beliefs.votes import vote
-from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.instances.instances import Instance, check_instances
 from bmask_slam.semantics.instances.surfaces import surfaces_of, up_of
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.objects.gravity import GravityEstimator

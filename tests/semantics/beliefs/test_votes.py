@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.semantics.beliefs.pixel_assignment import (
-    assign_pixels,
-    check_instances,
-    grouped_median,
-)
+from bmask_slam.semantics.beliefs.pixel_assignment import assign_pixels, grouped_median
 from bmask_slam.semantics.beliefs.vote_config import VoteConfig
 from bmask_slam.semantics.beliefs.votes import vote
-from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.instances.instances import (
+    Instance,
+    certain,
+    check_instances,
+    mask_box,
+)
 from bmask_slam.semantics.labels import label_set
 
 SIZE = (120, 160)

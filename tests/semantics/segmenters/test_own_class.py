@@ -16,6 +16,8 @@ from bmask_slam.labelling.config import SemanticsConfig
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 
 MODULE = """
+import numpy as np
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.labels import label_set
 
 class Fine:
@@ -32,6 +34,16 @@ class Mute:
 
 class Nameless(Fine):
     labels = ["thing"]
+
+class Small(Fine):
+    def segment(self, image, name):
+        mask = np.ones((20, 30), bool)
+        return [Instance(mask, mask_box(mask), 1, certain(1, 2), 1.0, 1.0)]
+
+class Unlisted(Fine):
+    def segment(self, image, name):
+        mask = np.ones(image.shape[:2], bool)
+        return [Instance(mask, mask_box(mask), 2, certain(2, 3), 1.0, 1.0)]
 """
 IMAGE = np.zeros((40, 60, 3), np.uint8)
 
@@ -68,6 +80,16 @@ def test_a_class_on_pythonpath_is_a_segmenter(folder, monkeypatch) -> None:
     }.items():
         with pytest.raises(InputError, match=words):
             make(name, folder)
+
+
+@pytest.mark.parametrize(("name", "words"), [("Small", "a mask of shape"), ("Unlisted", "label 2")])
+def test_instances_of_another_image_or_label_set_are_refused(
+    folder, monkeypatch, name: str, words: str
+) -> None:
+    """They ended `segment` in a traceback where they were drawn."""
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    with pytest.raises(InputError, match=rf"^segmenter own_masks:{name}: a\.png: {words}"):
+        make(f"own_masks:{name}", folder).segment(IMAGE, "a.png")
 
 
 def test_nothing_is_imported_from_the_current_folder(folder, monkeypatch) -> None:
