@@ -164,6 +164,8 @@ def _network(options: SegmenterOptions, find_weights: FindWeights) -> Segmenter:
     """A network segmenter; torch is imported here since that takes a second."""
     if options.weights is None and options.name != "light":
         raise InputError(f"segmenter {options.name!r}: give --weights, a file or torchvision:NAME")
+    if not 0 <= options.min_score <= 1:  # nothing would be found; so for NaN
+        raise InputError(f"min_score {options.min_score:g}: a class score is 0 to 1; give another")
     import_extra(*needed_by(options))
     from bmask_slam.semantics.network.yolox.selection import SelectionConfig  # noqa: PLC0415
     from bmask_slam.semantics.segmenters.light_segmenter import LightSegmenter  # noqa: PLC0415

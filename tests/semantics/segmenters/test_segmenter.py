@@ -424,3 +424,9 @@ def test_the_table_of_names(tmp_path: Path) -> None:
     folder = make_segmenter(SegmenterOptions("precomputed", masks=tmp_path), tmp_path)
     assert isinstance(folder, LabelImageSegmenter)
     assert len(folder.labels) == 81
+
+
+@pytest.mark.parametrize("min_score", [50.0, -0.1, math.nan])
+def test_a_limit_that_is_no_score_is_refused(tmp_path: Path, min_score: float) -> None:
+    with pytest.raises(InputError, match=f"min_score {min_score:g}: a class score is 0 to 1"):
+        make_segmenter(SegmenterOptions(min_score=min_score), tmp_path)
