@@ -19,6 +19,7 @@ from unittest.mock import patch
 
 import cv2
 import numpy as np
+import PIL.Image
 import torch
 from engine import NUMBERS, TOKENS, Make, Reader
 from fake_run import CAMERA as SMALL_CAMERA
@@ -88,6 +89,7 @@ from bmask_slam.semantics.labels import label_set, read_label_set
 from bmask_slam.semantics.segmenters.mask_cache import CacheOptions, cache_masks
 from bmask_slam.semantics.segmenters.segmenter import LabelImageSegmenter, NoSegmenter
 from bmask_slam.semantics.weights.checkpoints import load_network, read_state
+from bmask_slam.semantics.weights.light_weights import load_light
 from bmask_slam.semantics.weights.stuff_weights import load_stuff
 from bmask_slam.semantics.weights.yolox_onnx import load_onnx
 from bmask_slam.sequences.bags.bag_file import open_bag
@@ -414,6 +416,13 @@ def network_maker(rng: random.Random) -> bytes:
 
 def label_image() -> bytes:
     return cv2.imencode(".png", np.arange(80, dtype=np.uint16).reshape(8, 10) % 3)[1].tobytes()
+
+
+def palette_image() -> bytes:
+    picture = PIL.Image.fromarray(np.arange(80, dtype=np.uint8).reshape(8, 10) % 3).convert("P")
+    out = io.BytesIO()
+    picture.save(out, "png")
+    return out.getvalue()
 
 
 def surfaces_maker(rng: random.Random) -> bytes:
@@ -873,12 +882,7 @@ def binary_readers(folder: Path) -> list[Reader]:
     database = bag_folder(recorded["a.db3"], recorded["db"].decode())
     return [
         Reader("image", "1.png", both_pictures, images()),
-        Reader(
-            "label image",
-            "a.png",
-            read_label_image,
-            (cv2.imencode(".png", np.arange(80, dtype=np.uint16).reshape(8, 10) % 3)[1].tobytes(),),
-        ),
+        Reader("label image", "a.png", read_label_image, (label_image(), palette_image())),
         Reader("surfaces", "1.png", read_surface_image, surface_images(), surfaces_maker),
         Reader("archive", "a.tgz", unpacked, packed, zip_maker),
         Reader("ROS 1 bag", "a.bag", read_bag, (recorded["a.bag"],)),
@@ -906,6 +910,7 @@ def binary_readers(folder: Path) -> list[Reader]:
         Reader("safetensors", "w.safetensors", read_state, weights(), safetensors_maker),
         Reader("network of weights", "w.safetensors", load_network, weights()[1:], network_maker),
         Reader("head for stuff", "w.safetensors", load_stuff, weights(), safetensors_maker),
+        Reader("light network", "w.safetensors", load_light, weights(), safetensors_maker),
         Reader("PyTorch weights", "w.pth", read_state, pickled(folder)),
         Reader("ONNX weights", "w.onnx", load_onnx, (b"",), onnx_maker),
     ]
