@@ -32,7 +32,7 @@ class RunSummary:
         skipped: frames that were broken, not counted in ``frames``.
         stopped_by: the signal that ended the run early, or None.
         calibration: what was found of the camera, in one line; "" if nothing was tried.
-        warnings: what the run says against its camera, each with its evidence.
+        warnings: what the run says against its stamps and camera, each with its evidence.
         resumable: the run can be resumed from its last checkpoint, since it was stopped.
     """
 
@@ -79,7 +79,7 @@ def finish_run(run: ActiveRun) -> RunSummary:
         stopped_by,
         resumable,
         text,
-        checked.warnings + _unwritten_checkpoints(run),
+        run.sequence.recording.warnings + checked.warnings + _unwritten_checkpoints(run),
     )
 
 

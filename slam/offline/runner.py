@@ -220,6 +220,8 @@ def describe_run(folder: RunFolder, options: RunOptions, sequence: Sequence) -> 
     logger.info("%d frames; %s without a partner", len(sequence), unpaired)
     for index, reason in sequence.skipped:  # found before the log was open
         logger.info("frame %d is broken: %s", index, reason)
+    for text in sequence.recording.warnings:
+        logger.warning(text)
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,9 @@ MAX_DEPTH_STEP_S = 0.1
 """Largest time between two depth images for interpolation between them."""
 HALF_INTERVAL = 0.55
 """Of the interval between depth images: stamps are not quite regular."""
+MIN_IN_ORDER, MIN_MIXED, MAX_SET_BACKS = 10, 5, 5
+"""A clock was set back where so many images before and behind are in order, so many behind share
+the time of those before, and that not too often."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +37,15 @@ class ImageList:
         files: the N images.
         unordered: how many stood behind one with a later stamp.
         repeated: how many were left out since another has their stamp.
+        set_back: where a clock was probably set back while this was recorded, and a cure; "" if
+            nothing speaks for that.
     """
 
     timestamps_s: Array
     files: tuple[Path, ...]
     unordered: int = 0
     repeated: int = 0
+    set_back: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +238,31 @@ def sorted_list(path: Path, stamps_s: Array, files: Sequence[Path]) -> ImageList
     if unordered or repeated:
         text = "%s: %d stamps out of order were sorted, %d repeated ones left out"
         logger.warning(text, path, unordered, repeated)
-    return ImageList(kept_s, tuple(files[k] for k in first), unordered, repeated)
+    found = clock_set_back(path, stamps_s) if unordered else ""
+    return ImageList(kept_s, tuple(files[k] for k in first), unordered, repeated, found)
+
+
+def clock_set_back(path: Path, stamps_s: Array) -> str:
+    """Where stamps (N,) as recorded begin again within the time of those before; "" if nowhere.
+
+    A list that somebody shuffled goes back often; pieces that only stand in another order do not
+    share any time. Images that a clock gave the same time are of two views, and sorted they
+    alternate.
+    """
+    back = np.flatnonzero(np.diff(stamps_s) < 0) + 1
+    pieces_s = np.split(stamps_s, back)
+    if len(back) > MAX_SET_BACKS or min(map(len, pieces_s)) < MIN_IN_ORDER:
+        return ""
+    for before_s, behind_s in pairwise(pieces_s):
+        mixed = int(np.count_nonzero((behind_s >= before_s[0]) & (behind_s <= before_s[-1])))
+        if mixed >= MIN_MIXED:
+            by_s = float(before_s[-1] - behind_s[0])
+            return (
+                f"{path}: the stamps go back by {by_s:.3f} s behind {before_s[-1]:.6f} s, and "
+                f"{mixed} images lie between earlier ones; if the clock was set back there, add "
+                "the time to the stamps behind, or run the two parts alone"
+            )
+    return ""
 
 
 def _image_list(path: Path, rows: list[tuple[int, float, str]]) -> ImageList:

@@ -95,6 +95,11 @@ class Recording:
     exists: Callable[[Path], bool] = Path.is_file
     lens: Lens | None = None
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What makes the order of the images doubtful; of colour, or else of depth."""
+        return tuple(filter(None, (self.rgb.set_back, self.depth.set_back)))[:1]
+
     def read_rgb(self, file: Path, camera: Camera) -> Image:
         """The colour image (H, W, 3), red first, reduced as the camera says.
 

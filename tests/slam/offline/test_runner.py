@@ -178,6 +178,19 @@ def test_warnings_at_opening_are_in_the_log(sequence: Path, out: Path) -> None:
     assert "camera.yaml: Camera(width=32" in log
 
 
+def test_a_clock_that_was_set_back_is_said(sequence: Path, out: Path) -> None:
+    assert fake_run(sequence, out).warnings == ()
+    for name in ("rgb.txt", "depth.txt"):
+        rows = [line.split() for line in (sequence / name).read_text().splitlines()]
+        rows = [(float(row[0]), row[1]) for row in rows if row[0] != "#"]
+        back_s = 7.5 * (rows[1][0] - rows[0][0])
+        lines = [f"{s - back_s * (k >= 10):.6f} {file}\n" for k, (s, file) in enumerate(rows)]
+        (sequence / name).write_text("".join(lines))
+    (text,) = fake_run(sequence, out, overwrite=True).warnings
+    assert "rgb.txt: the stamps go back by" in text
+    assert text in (out / "log.txt").read_text()
+
+
 def test_another_reference(sequence: Path, out: Path, tmp_path: Path) -> None:
     truth = true_trajectory(20)
     poses = truth.poses_world_camera.copy()

@@ -5,6 +5,7 @@ import json
 import re
 import threading
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from repository import KITCHEN
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences.info import format_info, info_as_json, sequence_info
+from bmask_slam.sequences.lists import clock_set_back
 from bmask_slam.sequences.prefetch import prefetched
 from bmask_slam.sequences.recording import Recording
 from bmask_slam.sequences.sequence import open_sequence
@@ -101,6 +103,23 @@ def test_order_of_lines_never_matters(folder):
     np.testing.assert_array_equal(after.timestamps_s, before.timestamps_s)
     assert after.pairs.rgb_files == before.pairs.rgb_files
     assert after.pairs.depth_files == before.pairs.depth_files
+
+
+def test_a_clock_that_was_set_back_is_told_from_other_orders():
+    stamps_s = 100 + np.arange(60) / 30
+    rng = np.random.default_rng(0)
+    others = {
+        "sorted": stamps_s,
+        "backward": stamps_s[::-1],
+        "shuffled": rng.permutation(stamps_s),
+        "two pieces in the other order": np.roll(stamps_s, 30),
+        "one late line": np.append(np.delete(stamps_s, 5), stamps_s[5]),
+    }
+    for name, order in others.items():
+        assert clock_set_back(Path("rgb.txt"), order) == "", name
+    set_back = stamps_s - 0.81 * (np.arange(60) >= 30)
+    text = clock_set_back(Path("rgb.txt"), set_back)
+    assert "go back by 0.777 s behind 100.966667 s, and 24 images lie between earlier ones" in text
 
 
 def test_pairs_by_time_not_by_line(folder):
