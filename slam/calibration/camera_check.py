@@ -101,18 +101,19 @@ def check_camera(run: SavedRun, sequence: Sequence) -> CameraCheck:
     return CameraCheck(warnings, tuple(f.text for f in findings if not f.is_warning), tuple(rows))
 
 
-def depth_warning(sequence: Sequence) -> str:
+def depth_warning(sequence: Sequence, used_to_m: float = FARTHEST_M) -> str:
     """What is wrong with the unit of depth: a camera sees things that are near, but not too near.
 
-    "" where nothing is, or no image has depth.
+    "" where nothing is, or no image has depth. Depth beyond ``used_to_m`` is not used in the run.
     """
     _, (_, median_m, _) = depth_statistics(sequence, DEPTH_FRAMES)
-    if not (median_m < NEAREST_M or median_m > FARTHEST_M):
+    if not (median_m < NEAREST_M or median_m > min(used_to_m, FARTHEST_M)):
         return ""
     scale = sequence.camera.depth_scale
+    unused = f"; most is beyond the {used_to_m:g} m that are used" * (median_m > used_to_m)
     return (
         f"depth: {median_m:.4g} m in the median, with depth_scale {scale:g}; check depth_scale in "
-        "camera.yaml, what a depth image has for one metre: 1000, 5000 or, of metres, 1"
+        f"camera.yaml, what a depth image has for one metre: 1000, 5000 or, of metres, 1{unused}"
     )
 
 

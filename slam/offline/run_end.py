@@ -13,8 +13,10 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.whole_file import remove
 from bmask_slam.offline.frame_loop import ActiveRun, map_options, write_found_camera
 from bmask_slam.run_folder.folder import CHECKPOINT, DENSE
+from bmask_slam.run_folder.frame_file import FRAMES, read_frames
 from bmask_slam.run_folder.metrics import measure, row, save
 from bmask_slam.run_folder.reader import STOPPED
+from bmask_slam.run_folder.weak_frames import weak_warning
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.system import SlamSystem
 
@@ -32,7 +34,7 @@ class RunSummary:
         skipped: frames that were broken, not counted in ``frames``.
         stopped_by: the signal that ended the run early, or None.
         calibration: what was found of the camera, in one line; "" if nothing was tried.
-        warnings: what the run says against its stamps and camera, each with its evidence.
+        warnings: what the run says against its stamps, frames and camera, each with its evidence.
         resumable: the run can be resumed from its last checkpoint, since it was stopped.
     """
 
@@ -79,7 +81,10 @@ def finish_run(run: ActiveRun) -> RunSummary:
         stopped_by,
         resumable,
         text,
-        run.sequence.recording.warnings + checked.warnings + _unwritten_checkpoints(run),
+        run.sequence.recording.warnings
+        + _weakly_tracked(run)
+        + checked.warnings
+        + _unwritten_checkpoints(run),
     )
 
 
@@ -94,6 +99,20 @@ def _look_back(run: ActiveRun) -> None:
         remove(run.folder.path / DENSE)
 
 
+def _weakly_tracked(run: ActiveRun) -> tuple[str, ...]:
+    """A warning if many frames are WEAK, which is logged too."""
+    try:
+        frames = read_frames(run.folder.path / FRAMES)
+    except (InputError, OSError) as error:
+        logger.info("frames not looked at: %s", error)
+        return ()
+    text = weak_warning(frames, run.options.config.tracking.min_inliers)
+    if not text:
+        return ()
+    logger.warning(text)
+    return (text,)
+
+
 def _unwritten_checkpoints(run: ActiveRun) -> tuple[str, ...]:
     """A warning if there are any; a resumed run would have begun with an earlier one."""
     if not run.unwritten:
@@ -106,7 +125,7 @@ def _camera_checked(run: ActiveRun) -> CameraCheck:
     nothing = CameraCheck((), (), ())
     if not isinstance(run.system, SlamSystem) or run.stop.signal is not None:
         return nothing
-    if unit := depth_warning(run.sequence):
+    if unit := depth_warning(run.sequence, run.options.config.features.max_depth_m):
         logger.warning("camera: %s", unit)
         return CameraCheck((unit,), (), (row("camera_warnings", 1, "1"),))
     try:

@@ -37,15 +37,14 @@ class ImageList:
         files: the N images.
         unordered: how many stood behind one with a later stamp.
         repeated: how many were left out since another has their stamp.
-        set_back: where a clock was probably set back while this was recorded, and a cure; "" if
-            nothing speaks for that.
+        warnings: what makes stamps or images doubtful, each with a cure.
     """
 
     timestamps_s: Array
     files: tuple[Path, ...]
     unordered: int = 0
     repeated: int = 0
-    set_back: str = ""
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +238,8 @@ def sorted_list(path: Path, stamps_s: Array, files: Sequence[Path]) -> ImageList
         text = "%s: %d stamps out of order were sorted, %d repeated ones left out"
         logger.warning(text, path, unordered, repeated)
     found = clock_set_back(path, stamps_s) if unordered else ""
-    return ImageList(kept_s, tuple(files[k] for k in first), unordered, repeated, found)
+    kept, warnings = tuple(files[k] for k in first), (found,) if found else ()
+    return ImageList(kept_s, kept, unordered, repeated, warnings)
 
 
 def clock_set_back(path: Path, stamps_s: Array) -> str:

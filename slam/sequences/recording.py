@@ -97,8 +97,8 @@ class Recording:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What makes the order of the images doubtful; of colour, or else of depth."""
-        return tuple(filter(None, (self.rgb.set_back, self.depth.set_back)))[:1]
+        """What makes the stamps or images of the lists doubtful."""
+        return self.rgb.warnings + self.depth.warnings
 
     def read_rgb(self, file: Path, camera: Camera) -> Image:
         """The colour image (H, W, 3), red first, reduced as the camera says.

@@ -35,6 +35,7 @@ from bmask_slam.sequences.formats.phones import is_polycam, is_r3d, open_polycam
 from bmask_slam.sequences.formats.sens_file import is_sens, open_sens
 from bmask_slam.sequences.lists import read_lists
 from bmask_slam.sequences.recording import Recording
+from bmask_slam.sequences.repeats import without_repeats
 
 Given = Path | Camera | None
 MOST_BESIDE = 1000
@@ -74,11 +75,16 @@ def is_recording_file(path: Path) -> bool:
 
 
 def open_recording(path: Path, camera: Given = None) -> Recording:
-    """Open what lies at a path, in any layout of docs/data.md.
+    """Open what lies at a path, in any layout of docs/data.md, without images that were repeated.
 
     Raises:
         InputError: nothing there, no known layout, or files that are broken.
     """
+    return without_repeats(_open(path, camera))
+
+
+def _open(path: Path, camera: Given) -> Recording:
+    """What lies at a path. Raises InputError."""
     bag, _ = split_path(path)
     if is_bag(bag):
         return open_bag_recording(path, camera)

@@ -192,6 +192,17 @@ def test_a_wrong_unit_of_depth_is_told(depth_m: float, text: str) -> None:
     assert found.startswith(text) and bool(found) == bool(text)
 
 
+def test_depth_that_is_mostly_too_far_to_be_used_is_told() -> None:
+    class Images(list[SimpleNamespace]):
+        camera = Camera(6, 4, 5.0, 5.0, 3.0, 2.0)
+        load = list.__getitem__
+
+    sequence: Any = Images([SimpleNamespace(depth_m=np.full((4, 6), 9.0, np.float32))] * 3)
+    assert depth_warning(sequence) == ""
+    assert depth_warning(sequence, 10.0) == ""
+    assert "1; most is beyond the 8 m that are used" in depth_warning(sequence, 8)
+
+
 def test_a_broken_image_does_not_hide_a_wrong_unit_of_depth() -> None:
     class Images(list[SimpleNamespace]):
         camera = Camera(6, 4, 5.0, 5.0, 3.0, 2.0)

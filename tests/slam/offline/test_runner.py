@@ -186,7 +186,8 @@ def test_a_clock_that_was_set_back_is_said(sequence: Path, out: Path) -> None:
         back_s = 7.5 * (rows[1][0] - rows[0][0])
         lines = [f"{s - back_s * (k >= 10):.6f} {file}\n" for k, (s, file) in enumerate(rows)]
         (sequence / name).write_text("".join(lines))
-    (text,) = fake_run(sequence, out, overwrite=True).warnings
+    text, of_depth = fake_run(sequence, out, overwrite=True).warnings
+    assert "depth.txt: the stamps go back by" in of_depth
     assert "rgb.txt: the stamps go back by" in text
     assert text in (out / "log.txt").read_text()
 
