@@ -12,11 +12,11 @@ from bmask_slam.evaluation import Row
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.whole_file import remove
 from bmask_slam.offline.frame_loop import ActiveRun, map_options, write_found_camera
+from bmask_slam.offline.weak_frames import weakly_tracked
 from bmask_slam.run_folder.folder import CHECKPOINT, DENSE
-from bmask_slam.run_folder.frame_file import FRAMES, read_frames
+from bmask_slam.run_folder.frame_file import FRAMES
 from bmask_slam.run_folder.metrics import measure, row, save
 from bmask_slam.run_folder.reader import STOPPED
-from bmask_slam.run_folder.weak_frames import weak_warning
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.system import SlamSystem
 
@@ -82,7 +82,7 @@ def finish_run(run: ActiveRun) -> RunSummary:
         resumable,
         text,
         run.sequence.recording.warnings
-        + _weakly_tracked(run)
+        + weakly_tracked(folder / FRAMES, options.config.tracking.min_inliers)
         + checked.warnings
         + _unwritten_checkpoints(run),
     )
@@ -97,20 +97,6 @@ def _look_back(run: ActiveRun) -> None:
         run.sequence = run.sequence.with_camera(run.calibrator.state.camera)
         write_found_camera(run)
         remove(run.folder.path / DENSE)
-
-
-def _weakly_tracked(run: ActiveRun) -> tuple[str, ...]:
-    """A warning if many frames are WEAK, which is logged too."""
-    try:
-        frames = read_frames(run.folder.path / FRAMES)
-    except (InputError, OSError) as error:
-        logger.info("frames not looked at: %s", error)
-        return ()
-    text = weak_warning(frames, run.options.config.tracking.min_inliers)
-    if not text:
-        return ()
-    logger.warning(text)
-    return (text,)
 
 
 def _unwritten_checkpoints(run: ActiveRun) -> tuple[str, ...]:

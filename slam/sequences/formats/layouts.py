@@ -32,10 +32,10 @@ from bmask_slam.sequences.formats.numbered_folders import (
     open_seven_scenes,
 )
 from bmask_slam.sequences.formats.phones import is_polycam, is_r3d, open_polycam, open_r3d
+from bmask_slam.sequences.formats.repeats import without_repeats
 from bmask_slam.sequences.formats.sens_file import is_sens, open_sens
 from bmask_slam.sequences.lists import read_lists
 from bmask_slam.sequences.recording import Recording
-from bmask_slam.sequences.repeats import without_repeats
 
 Given = Path | Camera | None
 MOST_BESIDE = 1000

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from bmask_slam.run_folder.frame_file import read_frames
-from bmask_slam.run_folder.weak_frames import CONTRADICTED, FEW, UNCERTAIN, weak_warning
+from bmask_slam.offline.weak_frames import CONTRADICTED, FEW, UNCERTAIN, weakly_tracked
 
 HEAD = "index,timestamp,status,segment,matches,inliers,keyframe\n"
 
@@ -15,7 +14,7 @@ def told(path: Path, weak: int, matches: int, inliers: int) -> str:
     kinds = [f"WEAK,0,{matches},{inliers}"] * weak + ["OK,0,300,200"] * (40 - weak)
     rows = (f"{k},{k / 30:.6f},{kind},\n" for k, kind in enumerate(kinds))
     (path / "frames.csv").write_text(HEAD + "".join(rows))
-    return weak_warning(read_frames(path / "frames.csv"), 30)
+    return "".join(weakly_tracked(path / "frames.csv", 30))
 
 
 @pytest.mark.parametrize(

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
+from pathlib import Path
 
-from bmask_slam.run_folder.frame_file import FrameTable
+from bmask_slam.graph.errors import InputError
+from bmask_slam.run_folder.frame_file import FrameTable, read_frames
 from bmask_slam.tracking.results import TrackingStatus
+
+logger = logging.getLogger(__name__)
 
 MIN_SHARE, MIN_FRAMES = 0.25, 10
 """Of the frames, and so many: fewer WEAK ones are turns and blur, as right recordings have them."""
@@ -21,6 +26,22 @@ CURES = {
     FEW: "more light, a slower camera or more frames a second help",
     UNCERTAIN: "the room is far, or depth_scale is too small",
 }
+
+
+def weakly_tracked(path: Path, min_inliers: int) -> tuple[str, ...]:
+    """The warning that a run's frames.csv gives reason for, if any; it is logged too.
+
+    ``min_inliers`` is what an OK frame needs.
+    """
+    try:
+        text = weak_warning(read_frames(path), min_inliers)
+    except InputError as error:
+        logger.info("frames not looked at: %s", error)
+        return ()
+    if not text:
+        return ()
+    logger.warning(text)
+    return (text,)
 
 
 def weak_warning(frames: FrameTable, min_inliers: int) -> str:
