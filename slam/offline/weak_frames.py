@@ -17,6 +17,10 @@ MIN_SHARE, MIN_FRAMES = 0.25, 10
 CONTRADICTED = "most matches contradict the pose"
 FEW = "few landmarks agree with the pose"
 UNCERTAIN = "the position is uncertain, few near points are in view or found again"
+NEVER = (
+    "tracking: no frame has a pose; a map begins where enough corners have depth: bmask-slam info "
+    "says how many pixels have it, at what distance"
+)
 CURES = {
     CONTRADICTED: (
         "either colour and depth, or the camera and its images, do not fit together (depth_scale, "
@@ -46,6 +50,8 @@ def weakly_tracked(path: Path, min_inliers: int) -> tuple[str, ...]:
 
 def weak_warning(frames: FrameTable, min_inliers: int) -> str:
     """A line that says why the frames of a run are doubtful; "" where only a few are."""
+    if len(frames) >= MIN_FRAMES and set(frames.status) == {TrackingStatus.LOST.value}:
+        return NEVER
     reasons = Counter(
         _reason(matches, inliers, min_inliers)
         for status, matches, inliers in zip(

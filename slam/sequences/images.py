@@ -22,6 +22,11 @@ SURFACE_STEP = 0.05
 """Relative change of depth, in time or from pixel to pixel, beyond which it is another surface."""
 MIN_WORKING_PX = 225_000
 """Images are reduced to no fewer pixels, such as 640 x 360."""
+TILE_PX, MOST_SHARE, SPARSE_SHARE, LEAST_TILES = 7, 0.9, 0.75, 30
+"""Depth is scattered where nine of ten tiles have it at a smaller share of their pixels, of those
+with depth in the middle, if these are enough."""
+FILLED_PX = 3.0
+"""How far a scattered depth counts."""
 
 
 def read_rgb(path: Path, camera: Camera) -> Image:
@@ -108,8 +113,9 @@ def depth_in_metres(stored: NDArray, camera: Camera) -> Floats:
     """Depth (H, W) in metres from stored values, integers or floats.
 
     Paper eq. 9 and an offset, 1/z less the camera's ``depth_distortion``; NaN where the values are
-    0, negative or not finite, and in what is covered.
+    0, negative or not finite, and in what is covered. Scattered depth is filled.
     """
+    stored = filled_depth(stored)
     depth_m = np.divide(stored, np.float32(camera.depth_scale), dtype=np.float32)
     if camera.depth_offset_m:
         depth_m += np.float32(camera.depth_offset_m)
@@ -118,6 +124,27 @@ def depth_in_metres(stored: NDArray, camera: Camera) -> Floats:
             depth_m /= 1 - depth_m * _depth_bend(camera)
     depth_m[~((stored > 0) & (depth_m > 0) & (depth_m < np.inf))] = np.nan
     return without_covered(depth_m, camera)
+
+
+def filled_depth(stored: NDArray) -> NDArray:
+    """Depth (H, W) in any unit, 0 or NaN where missing; if it is scattered, with the nearest value.
+
+    A coarser depth camera that was registered point by point leaves a grid of holes in the colour
+    image, in which no window around a keypoint has depth enough. Holes of other depth images stay.
+    """
+    valid = np.asarray(stored > 0)
+    rows, columns = (size // TILE_PX for size in valid.shape)
+    tiles = valid[: rows * TILE_PX, : columns * TILE_PX]
+    tiles = tiles.reshape(rows, TILE_PX, columns, TILE_PX)
+    shares = tiles.mean(axis=(1, 3))[tiles[:, TILE_PX // 2, :, TILE_PX // 2]]
+    if len(shares) < LEAST_TILES or np.quantile(shares, MOST_SHARE) >= SPARSE_SHARE:
+        return stored
+    distance, labels = cv2.distanceTransformWithLabels(
+        (~valid).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    values = np.zeros(labels.max() + 1, stored.dtype)
+    values[labels[valid]] = stored[valid]
+    return np.where(distance <= FILLED_PX, values[labels], stored.dtype.type(0))
 
 
 def without_covered(depth_m: Floats, camera: Camera) -> Floats:
