@@ -220,7 +220,10 @@ def describe_run(folder: RunFolder, options: RunOptions, sequence: Sequence) -> 
     logger.info("%d frames; %s without a partner", len(sequence), unpaired)
     for index, reason in sequence.skipped:  # found before the log was open
         logger.info("frame %d is broken: %s", index, reason)
-    for text in sequence.recording.warnings:
+    recording = sequence.recording
+    if any(copies := (recording.rgb.copies, recording.depth.copies)):
+        logger.info("%d colour and %d depth images repeat the one before, and are used", *copies)
+    for text in recording.warnings:
         logger.warning(text)
 
 

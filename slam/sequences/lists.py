@@ -37,6 +37,7 @@ class ImageList:
         files: the N images.
         unordered: how many stood behind one with a later stamp.
         repeated: how many were left out since another has their stamp.
+        copies: how many repeat the image before, if these stayed.
         warnings: what makes stamps or images doubtful, each with a cure.
     """
 
@@ -44,6 +45,7 @@ class ImageList:
     files: tuple[Path, ...]
     unordered: int = 0
     repeated: int = 0
+    copies: int = 0
     warnings: tuple[str, ...] = ()
 
 
@@ -239,7 +241,7 @@ def sorted_list(path: Path, stamps_s: Array, files: Sequence[Path]) -> ImageList
         logger.warning(text, path, unordered, repeated)
     found = clock_set_back(path, stamps_s) if unordered else ""
     kept, warnings = tuple(files[k] for k in first), (found,) if found else ()
-    return ImageList(kept_s, kept, unordered, repeated, warnings)
+    return ImageList(kept_s, kept, unordered, repeated, warnings=warnings)
 
 
 def clock_set_back(path: Path, stamps_s: Array) -> str:

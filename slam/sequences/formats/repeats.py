@@ -22,8 +22,9 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences.lists import ImageList
 from bmask_slam.sequences.recording import Recording
 
-MIN_SHARE = 0.2
-"""Of a list: fewer single images that repeat the one before stay, as they are hardly noticed."""
+MIN_SHARE, MIN_TIMES = 0.2, 5
+"""A recorder repeats images if so large a share of a list repeats the one before, and so many
+times; single ones stay, and are counted."""
 LONG = 6
 """So many repetitions in a row are a hung driver or a simulated camera at rest."""
 JUMP = 2.0
@@ -45,10 +46,12 @@ def without_repeats(recording: Recording) -> Recording:
 def _kept(kind: str, images: ImageList, decode: Callable[[Path], Image]) -> ImageList:
     """The images of a list that are their own, with a warning if others were left out."""
     same = _repeats(images.files)
-    single, out, texts = np.zeros(len(same), bool), np.zeros(len(same), bool), []
+    single, out = np.zeros((2, len(same)), bool)
+    times, texts = 0, list[str]()
     for start, stop in _stretches(same):
         if stop - start < LONG:
             single[start:stop] = True
+            times += 1
         elif _moved_on(images.files, same, stop, decode):
             out[start:stop] = True
             at_s = images.timestamps_s[start - 1]
@@ -56,14 +59,14 @@ def _kept(kind: str, images: ImageList, decode: Callable[[Path], Image]) -> Imag
                 f"{stop - start} {kind} images behind {at_s:.6f} s repeat that one, and the view "
                 "jumps then: the driver hung; they are left out"
             )
-    if np.count_nonzero(single) > MIN_SHARE * len(same):
+    if times >= MIN_TIMES and np.count_nonzero(single) > MIN_SHARE * len(same):
         out |= single
         texts.append(
             f"{np.count_nonzero(single)} of {len(same)} {kind} images repeat the one before with "
             "another stamp; they are left out: record each image once, with the camera's stamp"
         )
     if not texts:
-        return images
+        return replace(images, copies=int(np.count_nonzero(same)))
     files = tuple(file for file, is_out in zip(images.files, out, strict=True) if not is_out)
     warnings = (*images.warnings, *texts)
     return replace(images, timestamps_s=images.timestamps_s[~out], files=files, warnings=warnings)

@@ -66,6 +66,7 @@ def test_single_repetitions_and_right_recordings_stay(recording: Path) -> None:
         sequence = opened(recording, rgb, EACH)
         assert shown(sequence) == rgb
         assert sequence.recording.warnings == ()
+        assert sequence.recording.rgb.copies == (6 if rgb == few else 0)
 
 
 def test_a_driver_that_hung_is_told_from_a_simulated_camera_at_rest(recording: Path) -> None:
