@@ -14,7 +14,7 @@ from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number
 from bmask_slam.graph.files.file_names import check_name
 from bmask_slam.graph.files.reading import read_lines
-from bmask_slam.graph.trajectory import associate_stamps, check_seconds
+from bmask_slam.graph.trajectory import associate_stamps, check_seconds, nearest_indices
 
 logger = logging.getLogger(__name__)
 
@@ -130,10 +130,11 @@ def pair_images(
     depth_time_offset_s: float,
     folder: Path,
 ) -> ImagePairs:
-    """Pair colour and depth one to one by nearest stamp.
+    """Pair colour and depth by nearest stamp, one to one where there is no offset.
 
     The capture time of a depth image, by which it is paired, is its stamp plus the offset. With an
-    offset no colour image lies further than half an interval from depth, whatever the limit.
+    offset no colour image lies further than half an interval from depth, whatever the limit, and
+    two may share a depth image: it is interpolated for each.
 
     Raises:
         InputError: no two stamps within the limit; ``folder`` begins the text.
@@ -141,7 +142,11 @@ def pair_images(
     depth_s = depth.timestamps_s + depth_time_offset_s
     if depth_time_offset_s:
         max_difference_s = max(max_difference_s, half_interval_s(np.diff(depth_s)))
-    i, j = associate_stamps(rgb.timestamps_s, depth_s, max_difference_s)
+        nearest = nearest_indices(depth_s, rgb.timestamps_s)
+        i = np.flatnonzero(np.abs(depth_s[nearest] - rgb.timestamps_s) <= max_difference_s)
+        j = nearest[i]
+    else:
+        i, j = associate_stamps(rgb.timestamps_s, depth_s, max_difference_s)
     if not len(i):
         raise InputError(
             f"{folder}: no colour and depth image within {max_difference_s:g} s of each other "
@@ -158,7 +163,7 @@ def pair_images(
         tuple(depth.files[k] if k >= 0 else None for k in neighbours),
         shares,
         len(rgb.files) - len(i),
-        len(depth.files) - len(j),
+        len(depth.files) - len(np.unique(j)),
     )
 
 

@@ -166,6 +166,20 @@ def test_groundtruth(folder):
         open_sequence(folder)
 
 
+def test_with_a_delay_no_colour_image_is_left_out_between_depth_images(folder):
+    for kind, jitter_s in ("rgb", 0.005), ("depth", 0.0):
+        rows = [row for row in (folder / f"{kind}.txt").read_text().splitlines() if "#" not in row]
+        stamped = (
+            f"{k / 30 + jitter_s * (k % 2):.6f} {row.split()[1]}\n" for k, row in enumerate(rows)
+        )
+        (folder / f"{kind}.txt").write_text("".join(stamped))
+    delayed = open_sequence(folder).with_delay(0.017)
+    files = delayed.pairs.depth_files
+    assert len(delayed) == len(rows) > len(set(files)) == len(rows) - delayed.pairs.unpaired_depth
+    between = zip(files[1:-1], delayed.pairs.neighbour_files[1:-1], strict=True)
+    assert all(neighbour not in (None, file) for file, neighbour in between)
+
+
 def test_another_delay_pairs_anew_and_decodes_nothing_twice(folder, monkeypatch):
     sequence = open_sequence(folder)
     delayed = sequence.with_delay(0.1)
