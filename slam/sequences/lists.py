@@ -142,9 +142,7 @@ def pair_images(
     depth_s = depth.timestamps_s + depth_time_offset_s
     if depth_time_offset_s:
         max_difference_s = max(max_difference_s, half_interval_s(np.diff(depth_s)))
-        nearest = nearest_indices(depth_s, rgb.timestamps_s)
-        i = np.flatnonzero(np.abs(depth_s[nearest] - rgb.timestamps_s) <= max_difference_s)
-        j = nearest[i]
+        i, j = _nearest_pairs(rgb.timestamps_s, depth_s, max_difference_s)
     else:
         i, j = associate_stamps(rgb.timestamps_s, depth_s, max_difference_s)
     if not len(i):
@@ -165,6 +163,13 @@ def pair_images(
         len(rgb.files) - len(i),
         len(depth.files) - len(np.unique(j)),
     )
+
+
+def _nearest_pairs(rgb_s: Array, depth_s: Array, max_difference_s: float) -> tuple[Ints, Ints]:
+    """Indices of colour images (N,), and for each of its nearest depth image, if within a limit."""
+    nearest = nearest_indices(depth_s, rgb_s)
+    near = np.flatnonzero(np.abs(depth_s[nearest] - rgb_s) <= max_difference_s)
+    return near, nearest[near]
 
 
 def half_interval_s(steps_s: Array) -> float:
