@@ -134,9 +134,11 @@ def filled_depth(stored: NDArray) -> NDArray:
     """
     valid = np.asarray(stored > 0)
     rows, columns = (size // TILE_PX for size in valid.shape)
-    tiles = valid[: rows * TILE_PX, : columns * TILE_PX]
-    tiles = tiles.reshape(rows, TILE_PX, columns, TILE_PX)
-    shares = tiles.mean(axis=(1, 3))[tiles[:, TILE_PX // 2, :, TILE_PX // 2]]
+    if min(rows, columns) == 0:
+        return stored
+    tiles = valid[: rows * TILE_PX, : columns * TILE_PX].astype(np.float32)
+    shares = cv2.resize(tiles, (columns, rows), interpolation=cv2.INTER_AREA)
+    shares = shares[tiles[TILE_PX // 2 :: TILE_PX, TILE_PX // 2 :: TILE_PX] > 0]
     if len(shares) < LEAST_TILES or np.quantile(shares, MOST_SHARE) >= SPARSE_SHARE:
         return stored
     distance, labels = cv2.distanceTransformWithLabels(
