@@ -46,7 +46,8 @@ from bmask_slam.graph.smoother.anchoring import anchor_components
 
 logger = logging.getLogger(__name__)
 
-CAMERA_NUMBERS = 5 + 5
+CAMERA_NUMBERS = 10
+"""Width, height, bf, depth scale, frame rate, and five of distortion."""
 _FIXED_COVARIANCE = 1e-12 * np.eye(6)  # micrometres, microradians
 
 
@@ -172,7 +173,12 @@ def _camera(rows: dict[str, Rows], notes: _Notes, path: Path) -> Camera:
             return Camera(round(2 * cx + 1), round(2 * cy + 1), fx, fy, cx, cy, **bf)
         width, height, bf_px_m, depth_scale, fps, k1, k2, p1, p2, k3 = notes.camera
         return Camera(
-            *(round(width), round(height), fx, fy, cx, cy),
+            round(width),
+            round(height),
+            fx,
+            fy,
+            cx,
+            cy,
             distortion=(k1, k2, p1, p2, k3),
             depth_scale=depth_scale,
             fps=fps,

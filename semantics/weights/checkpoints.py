@@ -244,8 +244,10 @@ def check_state(path: Path, state: State, model: nn.Module, name: str) -> None:
         if expected[k].is_floating_point() and not state[k].is_floating_point()
     ]
     kinds = (
-        *(("missing", missing), ("not known", extra)),
-        *(("of another shape", shaped), ("no floating-point numbers", whole)),
+        ("missing", missing),
+        ("not known", extra),
+        ("of another shape", shaped),
+        ("no floating-point numbers", whole),
     )
     parts = [
         f"{len(names)} {kind}: {', '.join(names[:SHOWN])}{' ...' if len(names) > SHOWN else ''}"

@@ -24,8 +24,8 @@ MAX_DEPTH_STEP_S = 0.1
 HALF_INTERVAL = 0.55
 """Of the interval between depth images: stamps are not quite regular."""
 MIN_IN_ORDER, MIN_MIXED, MAX_SET_BACKS = 10, 5, 5
-"""A clock was set back where so many images before and behind are in order, so many behind share
-the time of those before, and that not too often."""
+"""A clock was set back where so many images before and after that are in order, so many of those
+after it share the time of those before, and it happened at most so often."""
 
 
 @dataclass(frozen=True, eq=False)
