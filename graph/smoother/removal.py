@@ -8,7 +8,7 @@ pose (`graph.smoother.anchoring`), because frames are stored relative to it.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -62,6 +62,28 @@ class _Plan:
     rows: Ints
     dropped: Ints
     loose: Ints
+
+
+def with_behind_removed(
+    update: GraphUpdate, tables: FactorTables, config: SmootherConfig
+) -> GraphUpdate:
+    """The update, which removes observations whose landmark is behind the camera as well.
+
+    A step of the optimisation may carry a landmark of no depth and little parallax past infinity or
+    through its cameras. Its factors then hold nothing (their Jacobian is zero), and GTSAM fails
+    when it next linearises them.
+    """
+    observations = tables.observations.select(tables.observations.used_rows())
+    poses = tables.keyframes.values
+    axes, origin_m = poses[:, :3, 2], np.sum(poses[:, :3, 3] * poses[:, :3, 2], axis=1)
+    row = np.searchsorted(tables.keyframes.ids, observations.keyframe_ids)
+    points = tables.landmarks.get(observations.landmark_ids)
+    depth_m = np.sum(points * axes[row], axis=1) - origin_m[row]
+    behind = observations.pairs[depth_m < config.min_depth_m]
+    if not len(behind):
+        return update
+    pairs = np.concatenate([update.remove_observations, behind])
+    return replace(update, remove_observations=pairs)
 
 
 def remove(update: GraphUpdate, tables: FactorTables, config: SmootherConfig) -> Removal:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Arrays, Ints, no_ids
+from bmask_slam.graph.arrays import Array, Arrays, Ints, no_ids, no_pairs
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import (
     observation_errors,
@@ -37,7 +37,7 @@ from bmask_slam.graph.marginals.landmark_marginalisation import (
 from bmask_slam.graph.marginals.summaries import mark_retracted, mark_returned, with_returning
 from bmask_slam.graph.smoother.anchoring import anchor_components, release_anchors, with_first_prior
 from bmask_slam.graph.smoother.isam2 import Change, Solver, SolverError, apply_user_and_inertial
-from bmask_slam.graph.smoother.removal import Removal, remove
+from bmask_slam.graph.smoother.removal import Removal, remove, with_behind_removed
 from bmask_slam.graph.smoother.repair import repair, solve_without_own
 from bmask_slam.graph.smoother.storage import (
     factor_tables_of,
@@ -75,6 +75,7 @@ class Smoother:
         self._solver.elapsed_s = 0.0
         tables, model = self._tables, (self._tables, self._camera, self._config)
         update = with_first_prior(update, tables, self._config)
+        update = with_behind_removed(update, tables, self._config)
         # marginalised observations first: their new relative poses still hold the keyframes
         before = remove_marginalised(update, *model)
         removal = remove(update, tables, self._config)
@@ -100,14 +101,14 @@ class Smoother:
         """Full bundle adjustment (Levenberg-Marquardt, with the kernels) of the whole graph.
 
         With ``drop_outliers`` observations whose chi-square without the kernel is beyond the 95 %
-        bound are then removed, and the graph is optimised again.
-        Marginalised landmarks come back with all their observations, until they are marginalised
-        again.
+        bound are then removed, and the graph is optimised again. Those of landmarks that came to
+        lie behind the camera always are. Marginalised landmarks come back with all their
+        observations, until they are marginalised again.
         ISAM2 is discarded and rebuilt from the result if another update comes. A failure is
         repaired as in an update; if that fails, the values stay and the costs are NaN.
         """
         report, costs = UpdateReport(), [(math.nan, math.nan)]
-        self._solver.elapsed_s = 0.0
+        self._solver.elapsed_s, model = 0.0, (self._tables, self._config)
         reinsert(self._tables, self._camera, self._config)
 
         def solve(tables: FactorTables) -> None:
@@ -120,10 +121,9 @@ class Smoother:
                 if not self._repair(failure, no_ids(), report, solve):
                     logger.error("batch optimisation failed; the values stay as they were")
                     break
-            if not last:
-                wrong = wrong_observations(self._tables, self._camera)
-                update = GraphUpdate(remove_observations=wrong)
-                report.add_removal(remove(update, self._tables, self._config))
+            wrong = no_pairs() if last else wrong_observations(self._tables, self._camera)
+            update = with_behind_removed(GraphUpdate(remove_observations=wrong), *model)
+            report.add_removal(remove(update, *model))
         before, after = costs[-1]
         estimate = report.estimate(self._tables, self._solver.elapsed_s)
         return dataclasses.replace(estimate, cost_before=before, cost_after=after)

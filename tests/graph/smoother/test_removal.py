@@ -7,7 +7,7 @@ from synthetic_room import CAMERA, Room, make_room
 
 from bmask_slam.graph.factors.graph_estimate import RefusalReason
 from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, RelativePose
-from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.graph.smoother.smoother import Smoother
 
 ROOM = make_room(keyframes=8, points=80, noise_px=0.3)
@@ -275,3 +275,26 @@ def test_removal_in_the_first_update_after_a_restart() -> None:
     assert not estimate.rebuilt
     assert 3 not in estimate.keyframe_ids
     assert_isam_matches_tables(smoother)
+
+
+def test_a_landmark_that_a_step_carries_through_its_cameras_is_dropped() -> None:
+    """It holds nothing there, and GTSAM would fail at the next linearisation."""
+    smoother = filled(ROOM)
+    poses = smoother.estimate().poses_world_camera
+    point = transform(poses[4], np.array([[0.1, 0.1, 4.0]]))
+    seen = [CAMERA.project_stereo(transform(inverse(T), point))[0] for T in poses[3:5]]
+    measured = np.array(seen) * [1, 1, np.nan]
+    measured[:, 0] += np.sign(seen[1][0] - seen[0][0]) * np.array([49.0, -49.0])
+    views = Observations(np.array([3, 4]), np.array([900, 900]), measured, np.ones((2, 3)))
+    passed = smoother.update(
+        GraphUpdate(landmark_ids=np.array([900]), points_world=point, observations=views)
+    )
+    at = passed.points_world[passed.landmark_ids == 900]
+    assert transform(inverse(poses[4]), at)[0, 2] < 0
+    after = smoother.update(GraphUpdate())
+    assert not after.rebuilt
+    assert after.dropped_landmarks.tolist() == [900]
+    smoother.restart()
+    assert not smoother.update(GraphUpdate()).rebuilt
+    assert_isam_matches_tables(smoother)
+    assert_same_optimum(smoother, ROOM)
