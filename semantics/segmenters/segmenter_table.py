@@ -66,6 +66,11 @@ class SegmenterOptions:
         """Whether it is a network of this project, of which an image takes long."""
         return self.name in NETWORKS
 
+    @property
+    def is_shipped(self) -> bool:
+        """Whether it is the network that comes with this project, here, with its own weights."""
+        return self == SegmenterOptions(min_score=self.min_score, surfaces=self.surfaces)
+
     def described(self) -> dict[str, str]:
         """The options as text, to compare with those of another run."""
         return {key: str(value) for key, value in asdict(self).items()}

@@ -20,6 +20,7 @@ from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import Segmenter, check_image
 from bmask_slam.semantics.segmenters.segmenter_table import (
     SegmenterOptions,
+    labels_of,
     make_segmenter,
     measured_name,
     needed_by,
@@ -44,7 +45,13 @@ class SegmenterBeside(RemoteSegmenter):
     def __init__(
         self, options: SegmenterOptions, sequence: Path, upright: Upright | None = None
     ) -> None:
-        """Start the process, for the images of a sequence. Raises InputError if it cannot start."""
+        """Start the process, for the images of a sequence.
+
+        That of the shipped network is not waited for: it loads while the first frames are tracked.
+
+        Raises:
+            InputError: it cannot start.
+        """
         super().__init__(options, sequence, RestartPolicy(answer_s=ANSWER_S), upright=upright)
         self.measured = measured_name(options)
         self._count = 0
@@ -54,6 +61,8 @@ class SegmenterBeside(RemoteSegmenter):
 
     def _known_labels(self, options: SegmenterOptions, sequence: Path) -> LabelSet:
         load_filters()  # while the process loads its network
+        if options.is_shipped and 0 <= options.min_score <= 1:
+            return labels_of(options, sequence)
         return super()._known_labels(options, sequence)
 
     def begin(self, image: Image, name: str) -> None:
@@ -67,10 +76,13 @@ class SegmenterBeside(RemoteSegmenter):
         """The instances in an image, once they have come.
 
         Raises:
-            InputError: the image cannot be segmented, or the process died too often.
+            InputError: the image cannot be segmented, or the process could not start, or died too
+                often.
         """
         check_image(image, name)
         self.begin(image, name)
+        if not self.worker.labels:
+            self.worker.wait_until_ready()
         number = self._begun.pop(name)
         while number not in self._found and self.awaits(number):
             self._found |= {masks.keyframe_id: masks.instances for masks in self.receive_masks()}

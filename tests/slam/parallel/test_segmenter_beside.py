@@ -98,6 +98,21 @@ def test_weights_that_are_missing_are_named_as_by_a_segmenter_here(tmp_path: Pat
     assert "none.pth" in str(here.value) and str(there.value) == str(here.value)
 
 
+def test_the_shipped_network_is_not_waited_for(images) -> None:
+    with segmenter_of_run(OPTIONS, Path(), Upright("top")) as segmenter:
+        assert segmenter.worker.labels == ()  # its process has not answered yet
+        assert segmenter.labels == make_segmenter(OPTIONS, Path()).labels
+        assert segmenter.segment(images[0], "a")
+        assert segmenter.worker.labels == segmenter.labels.names
+
+
+def test_a_network_that_ends_while_it_loads_is_an_error_of_the_first_image(images) -> None:
+    with segmenter_of_run(OPTIONS, Path(), Upright("top")) as segmenter:
+        os.kill(segmenter.worker.pid, signal.SIGKILL)
+        with pytest.raises(InputError, match="the segmenter's process did not start"):
+            segmenter.segment(images[0], "a")
+
+
 def test_a_run_gives_the_same_bytes_with_one_processor(
     office: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
