@@ -125,3 +125,20 @@ def sweep_camera(late_sweep: Path) -> Camera:
     from bmask_slam.sequences.cameras import read_camera
 
     return replace(read_camera(late_sweep / "camera.yaml"), depth_time_offset_s=SWEEP_DELAY_S)
+
+
+@pytest.fixture(scope="session")
+def turned_sweep(
+    rendered: Callable[[RenderConfig], Path], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A sweep whose rows are read from the bottom up; camera.yaml says the opposite."""
+    from bmask_slam.rendering.config import RenderConfig
+    from bmask_slam.sequences.cameras import read_camera, write_camera
+
+    config = RenderConfig(
+        "office", 125, fps=15.0, width=320, height=240, sweeping=True, rolling_shutter_ms=-20.0
+    )
+    folder = shutil.copytree(rendered(config), tmp_path_factory.mktemp("turned") / "sweep")
+    camera = read_camera(folder / "camera.yaml")
+    write_camera(folder / "camera.yaml", replace(camera, rolling_shutter_s=0.02))
+    return folder

@@ -15,70 +15,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bmask_slam.calibration.calibrate import camera_from, with_rate_error
+from bmask_slam.calibration.config import BENDS, FREE, LIMITS_S, TIMES, SelfCalibrationConfig
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.calibration import CalibrationResult
 from bmask_slam.graph.calibration.cross_validation import CrossValidation, cross_validate
-from bmask_slam.graph.calibration.model import BEND, PARAMETERS, SHUTTER, TIME, parameters_of
+from bmask_slam.graph.calibration.model import BEND, SHUTTER, TIME, parameters_of
 from bmask_slam.graph.calibration.problem import CalibrationProblem
 from bmask_slam.graph.camera import Camera, depth_distortion_terms
 
 logger = logging.getLogger(__name__)
 
-TIMES = (SHUTTER, TIME)
-BENDS = tuple(range(len(PARAMETERS))[BEND])
-FREE = (*TIMES, *BENDS)  # what is estimated, by places in PARAMETERS
-CALIBRATE = ("auto", "report", "off")
-"""Whether what is found is used, only told, or not looked for."""
 NAMES = {SHUTTER: "rolling shutter", TIME: "colour-depth delay"}
-LIMITS_S = {SHUTTER: 0.035, TIME: 0.1}
+OTHER_ORDER = "rows are read from the bottom up, as in images turned by 180 degrees"
 UNOBSERVABLE = "readout, delay and bend of depth not observable in the motion"
 PLACES = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-0.75, 0.75, 7)), axis=-1)
 BEND_TERMS = depth_distortion_terms(PLACES).reshape(-1, len(BENDS))
 """Those of the distortion of depth at places all over an image of 4:3."""
-
-
-@dataclass(frozen=True)
-class SelfCalibrationConfig:
-    """How much is tracked, and when something is adopted.
-
-    Attributes:
-        frames: after which a run is looked at first; then after twice as many, and again, as long
-            as the motion does not show the parameters.
-        min_frames: fewer are not looked at, at the end of a sequence.
-        stretches: how often it is looked at in vain at most; live how often at all.
-        max_sigma_s, max_sigma_share: a time is observable if its standard deviation is below the
-            first, or below this share of the time.
-        min_change_sigmas, min_change_s: a time is adopted if it differs from the one in use by
-            both, in standard deviations and seconds.
-        min_gain_sigmas: and if observations kept out of the fit gain by so many standard errors.
-        max_readout_s: a readout time surely longer than a frame's interval is an error and refused;
-            of one that may be shorter so much is adopted.
-        max_delay_s: the same of the delay of depth; drivers may stamp images as they arrive.
-        max_bend_sigma, min_bend, max_bend: the same limits of the distortion of depth, in 1/m.
-        surer: a new distortion of depth replaces the adopted one if its standard deviation is
-            below this share of that one's.
-    """
-
-    frames: int = 105
-    min_frames: int = 90
-    stretches: int = 4
-    max_sigma_s: float = 0.004
-    max_sigma_share: float = 0.1
-    min_change_sigmas: float = 3.0
-    min_change_s: float = 0.002
-    min_gain_sigmas: float = 2.0
-    max_readout_s: float = LIMITS_S[SHUTTER]
-    max_delay_s: float = LIMITS_S[TIME]
-    max_bend_sigma: float = 0.004
-    min_bend: float = 0.003
-    max_bend: float = 0.1
-    surer: float = 0.75
-
-    def limits(self, i: int) -> tuple[float, float]:
-        """Smallest change and largest value of a parameter."""
-        if i in BENDS:
-            return self.min_bend, self.max_bend
-        return self.min_change_s, self.max_readout_s if i == SHUTTER else self.max_delay_s
 
 
 @dataclass(frozen=True)
@@ -93,6 +45,7 @@ class SelfCalibration:
         settled: whether it needs no other look.
         bend_sigma: standard deviation of the distortion of depth that was adopted, in 1/m.
         covered: the same of ``Camera.covered``.
+        rows: the same of the order of rows, where ``given`` has another than the camera before.
     """
 
     given: Camera
@@ -102,21 +55,31 @@ class SelfCalibration:
     settled: bool = False
     bend_sigma: float = 0.0
     covered: str = ""
+    rows: str = ""
 
     @property
     def adopted(self) -> bool:
         """Whether the camera is another one."""
         return self.camera != self.given
 
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """What was found, in lines."""
+        return tuple(filter(None, (self.rows, self.text, self.covered)))
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Of one stretch: the vector (18,) before and after, standard deviations, and the problem."""
+    """Of one stretch: the vector (18,) before and after, standard deviations, and the problem.
+
+    ``in_other_order``: rows are read upwards, other than the camera's readout time says.
+    """
 
     before: Array
     found: Array
     sigmas: Array
     problem: CalibrationProblem
+    in_other_order: bool = False
 
     def differs(self, i: int, config: SelfCalibrationConfig) -> bool:
         """Whether a parameter is observable, possible, and not that of the camera given."""
@@ -226,6 +189,27 @@ def judged(
     text = format_found(estimate, seen, verdict) if seen else UNOBSERVABLE
     settled = bool(len(seen) == np.count_nonzero(estimate.sigmas[list(free)]) and not differs)
     return replace(state, text=text, looks=state.looks + 1, settled=settled)
+
+
+def in_other_order(camera: Camera) -> Camera:
+    """The camera with rows that are read in the opposite order."""
+    return replace(camera, rolling_shutter_s=-camera.rolling_shutter_s)
+
+
+def with_other_order(state: SelfCalibration, mode: str) -> SelfCalibration:
+    """The state after an estimate that surely shows the other order of rows.
+
+    It becomes that of the camera given, so that all else is looked for anew. With a mode other than
+    "auto" it is only told; what such an estimate says of other parameters means nothing.
+    """
+    if mode != "auto":
+        return replace(state, text=f"{OTHER_ORDER}: found, not applied", settled=True)
+    return replace(
+        state,
+        given=in_other_order(state.given),
+        camera=in_other_order(state.camera),
+        rows=f"{OTHER_ORDER}: found and applied",
+    )
 
 
 def adopted_parameters(state: SelfCalibration) -> set[int]:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.calibration.config import CalibrationPriors
 from bmask_slam.calibration.motion import landmark_motion
-from bmask_slam.calibration.priors import CalibrationPriors
 from bmask_slam.calibration.report import Calibrated, format_calibration, parameters_named
 from bmask_slam.calibration.views import SequenceDepths, connected_views, make_views
 from bmask_slam.evaluation.ate_rpe import clock_of

@@ -9,17 +9,17 @@ a wrong camera does, and again in narrower ones around where the camera found so
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bmask_slam.calibration.adoption import FREE, TIMES, Estimate, estimate_of
+from bmask_slam.calibration.adoption import Estimate, estimate_of
 from bmask_slam.calibration.calibrate import (
     GAUGE_SIGMAS,
     MIN_KEYFRAMES,
 )
+from bmask_slam.calibration.config import FREE, TIMES, estimated_priors
 from bmask_slam.calibration.motion import MIN_DEPTH_M, twists_at
-from bmask_slam.calibration.priors import estimated_priors
 from bmask_slam.calibration.views import (
     DepthReader,
     Depths,
@@ -53,6 +53,10 @@ MAX_KEYFRAMES, MAX_OBSERVATIONS = 40, 8000
 QUICK = CalibrationConfig(rounds=2, steps=4, tolerance=1e-3)
 RADII_PX = (24.0, 8.0)
 """Of the windows around predicted pixels: by the run's camera, then by the one found so far."""
+
+OTHER_ORDER_SIGMAS = 5.0
+"""A readout time is surely of the other sign if it is so many standard deviations below 0."""
+SHUTTER_PRIOR_S = 0.03
 
 ITERATIONS = 2  # for the row that decides when a landmark was exposed
 
@@ -268,13 +272,29 @@ def estimate_again(
     problems = RunProblem(world, run, reader, given)
     if not problems.large_enough:
         return None
-    shutter_s, estimate = run.camera.rolling_shutter_s, None
+    shutter_s, estimate, other = run.camera.rolling_shutter_s, None, False
     for radius_px in RADII_PX:
         problem = problems.problem(shutter_s, radius_px)
         result = calibrate(problem, QUICK)
+        if estimate is None and given.rolling_shutter_s:
+            other = _is_in_other_order(problem, result)
         problems.move_to(result)
-        estimate = estimate_of(problem, result)
+        estimate = replace(estimate_of(problem, result), in_other_order=other)
         shutter_s = float(estimate.found[SHUTTER])
         if max(abs(estimate.found[i] - estimate.before[i]) for i in TIMES) < worth_s:
             break
     return estimate
+
+
+def _is_in_other_order(problem: CalibrationProblem, result: CalibrationResult) -> bool:
+    """Whether rows are surely read in the order opposite to that of the camera's readout time.
+
+    Keypoints then fit better with a readout time of the other sign.
+    """
+    sigmas = problem.prior_sigmas.copy()
+    sigmas[SHUTTER] = SHUTTER_PRIOR_S
+    free = calibrate(replace(problem, prior_sigmas=sigmas), QUICK)
+    found_s = free.calibration[SHUTTER] * np.sign(problem.calibration[SHUTTER])
+    sigma_s = np.sqrt(free.covariance[SHUTTER, SHUTTER])
+    better = free.noise_scales[0] < result.noise_scales[0]
+    return bool(found_s + OTHER_ORDER_SIGMAS * sigma_s < 0 and better)

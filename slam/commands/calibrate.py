@@ -71,7 +71,7 @@ def _add_metric_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _calibrate(arguments: argparse.Namespace) -> int:
     from bmask_slam.calibration.calibrate import CalibrateOptions
-    from bmask_slam.calibration.priors import CalibrationPriors
+    from bmask_slam.calibration.config import CalibrationPriors
     from bmask_slam.calibration.report import format_calibration, plain_calibration
     from bmask_slam.offline.calibration_rounds import calibrate_in_rounds
 

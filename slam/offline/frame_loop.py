@@ -96,7 +96,7 @@ def _begin(run: ActiveRun, checkpoints: Checkpoints) -> None:
     run.folder.begin_anew()
     if found.adopted and not run.options.map:
         remove(run.folder.path / DENSE)
-    for text in filter(None, (found.covered, found.text)) if first else ():
+    for text in found.texts if first else ():
         events.begin_frame(first[0], float(run.sequence.timestamps_s[first[0]]))
         events.calibration(text)
         run.folder.write_events(events.take())
@@ -142,8 +142,8 @@ def process_frames(run: ActiveRun) -> bool:
 def write_found_camera(run: ActiveRun) -> None:
     """Write the camera that was found; without one, take back that of an earlier beginning."""
     found = run.calibrator.state
-    if found.adopted or (found.covered and found.camera.covered):
-        comment = "\n".join(filter(None, (found.text, found.covered)))
+    if found.adopted or found.rows or (found.covered and found.camera.covered):
+        comment = "\n".join(found.texts)
         run.folder.write_text(CAMERA, format_camera(found.camera, comment))
     else:
         run.folder.remove_text(CAMERA)

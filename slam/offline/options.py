@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from bmask_slam.calibration.adoption import CALIBRATE
+from bmask_slam.calibration.config import CALIBRATE
 from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences.camera_presets import is_preset
 from bmask_slam.system_config import SystemConfig

@@ -71,8 +71,7 @@ def finish_run(run: ActiveRun) -> RunSummary:
         run.folder.complete()
     folder = run.folder.path
     resumable = stopped_by is not None and (folder / CHECKPOINT).is_file()
-    found = run.calibrator.state
-    text = "; ".join(filter(None, (found.text, found.covered)))
+    text = "; ".join(run.calibrator.state.texts)
     return RunSummary(
         folder,
         rows,

@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from bmask_slam.calibration.adoption import SelfCalibration
+from bmask_slam.calibration.adoption import SelfCalibration, in_other_order
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation.reference import read_reference
 from bmask_slam.graph.camera import Camera
@@ -166,6 +166,8 @@ def _reopened(options: RunOptions, checkpoint: Checkpoint) -> Sequence:
     own, found = sequence.camera, checkpoint.calibration
     if found.covered:
         own = replace(own, covered=found.given.covered)
+    if found.rows:
+        own = in_other_order(own)
     return sequence if own != found.given else sequence.with_camera(found.camera)
 
 

@@ -24,13 +24,13 @@ import numpy as np
 
 from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.calibration.adoption import (
-    FREE,
     Estimate,
     SelfCalibration,
-    SelfCalibrationConfig,
     format_found,
     judged,
+    with_other_order,
 )
+from bmask_slam.calibration.config import FREE, SelfCalibrationConfig
 from bmask_slam.calibration.edge_delay import sure_registration, with_sure_delay
 from bmask_slam.calibration.edge_scores import edge_scores
 from bmask_slam.calibration.keyframe_motions import (
@@ -141,6 +141,8 @@ class SelfCalibrator:
         before, estimate = self.state, self._estimate(system, sequence)
         if estimate is None:
             return replace(before, looks=before.looks + 1)
+        if estimate.in_other_order:
+            return with_other_order(before, self._mode)
         found = judged(before, estimate, self._mode, self._config)
         if not before.adopted:
             return found

@@ -15,14 +15,14 @@ import numpy as np
 
 from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.calibration.adoption import (
-    FREE,
     Estimate,
     SelfCalibration,
-    SelfCalibrationConfig,
     adopted_parameters,
     format_found,
     judged,
+    with_other_order,
 )
+from bmask_slam.calibration.config import FREE, SelfCalibrationConfig
 from bmask_slam.calibration.edge_delay import MAX_DELAY_S, EdgeDelay, sure_registration
 from bmask_slam.calibration.edge_scores import FrameEdges, scores_of
 from bmask_slam.calibration.keyframe_depth import KeptDepths, KeyframeDepth, KeyframeImages
@@ -129,29 +129,46 @@ class CalibrationServer:
         self._looks += 1
         run, world, paths = read_state(message.state, setup.graph)
         kept = {k: depth for k, depth in self._depths.items() if k in world.keyframes}
-        try:
-            reader = KeptDepths(kept, run.camera)
-            estimate = estimate_again(world, run, reader, setup.camera, config.min_change_s)
-        except InputError as error:
-            logger.info("calibration: %s", error)
-            estimate = None
+        estimate = self._estimate(world, run, KeptDepths(kept, run.camera))
+        if estimate is not None and estimate.in_other_order:
+            return CameraEstimated(None, {}, self._state.text, True)
         edges = self._register(run, world)
         by_motion, contradicted = self._by_motion(estimate, edges)
         state, doubt = self._delay.judge(by_motion, edges)
         if self._lacks_delay(state):
             doubt = _joined(contradicted, doubt) or self._doubt(state, estimate)
-        self._state, text = state, _joined(state.text, doubt)
+        self._state, text = state, _joined(state.rows, state.text, doubt)
         shown = estimate is not None and estimate.shows(TIME, config)
         clear = not doubt and (shown or not self._lacks_delay(state))
         last = self._looks >= config.stretches
-        if state.adopted and state.camera != replace(run.camera, covered=state.camera.covered):
+        found = state.adopted or state.rows
+        if found and state.camera != replace(run.camera, covered=state.camera.covered):
             motions = self._motions(world, paths, run, state.camera)
             bent = _is_bent(world, run, state.camera)
-            done = before.adopted or (state is by_motion and setup.camera.rolling_shutter_s != 0)
+            straight = setup.camera.rolling_shutter_s != 0 and before.rows == state.rows
+            done = before.adopted or (state is by_motion and straight)
             settled = last or (done and not bent and clear)
             return CameraEstimated(state.camera, motions, text, settled, bent)
         done = state.adopted or state.settled
         return CameraEstimated(None, {}, text, last or (done and clear))
+
+    def _estimate(self, world: WorldMap, run: SavedRun, reader: KeptDepths) -> Estimate | None:
+        """What keyframes say of the camera, in the order of rows that they show, if that is used.
+
+        None if it is too little.
+        """
+        try:
+            for _ in range(2):
+                given = self._state.given
+                worth_s = self._setup.config.min_change_s
+                estimate = estimate_again(world, run, reader, given, worth_s)
+                if estimate is None or not estimate.in_other_order:
+                    break
+                self._state = with_other_order(self._state, self._setup.mode)
+        except InputError as error:
+            logger.info("calibration: %s", error)
+            return None
+        return estimate
 
     @property
     def _looks_at_edges(self) -> bool:

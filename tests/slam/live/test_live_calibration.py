@@ -18,7 +18,7 @@ from recorded_bags import DEPTH, INFO, RGB, BagMaker, image
 from shifted_stamps import with_depth_stamps
 from synthetic_view import CAMERA
 
-from bmask_slam.calibration.adoption import FREE, SelfCalibrationConfig
+from bmask_slam.calibration.config import FREE, SelfCalibrationConfig
 from bmask_slam.calibration.keyframe_depth import DepthImage, KeyframeImages
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation.ate_rpe import evaluate_trajectory
@@ -84,6 +84,22 @@ def test_a_delay_is_found_and_used(late_sweep, sweep_camera, short_stretch, tmp_
     told = played(late, tmp_path / "told", "report")
     assert told.calibration.endswith("found, not applied")
     assert told.camera.depth_time_offset_s == 0 and not (tmp_path / "told/camera.yaml").exists()
+
+
+def test_rows_that_are_read_upwards_are_noticed(
+    turned_sweep, short_stretch, monkeypatch, tmp_path
+) -> None:
+    """A camera of known readout time is looked at after twice as many frames."""
+    rules = partial(SelfCalibrationConfig, frames=57)
+    monkeypatch.setattr(start, "SelfCalibrationConfig", rules)
+    turned, found = open_sequence(turned_sweep), "as in images turned by 180 degrees: found"
+    slam = played(turned, tmp_path / "run", "auto")
+    assert f"{found} and applied" in slam.calibration
+    assert slam.camera.rolling_shutter_s == -0.02
+    assert read_run(tmp_path / "run").camera == slam.camera
+    told = played(turned, tmp_path / "told", "report")
+    assert told.calibration.endswith(f"{found}, not applied")
+    assert told.camera.rolling_shutter_s == 0.02 and not (tmp_path / "told/camera.yaml").exists()
 
 
 @pytest.fixture

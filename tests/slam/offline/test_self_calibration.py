@@ -18,18 +18,20 @@ from fake_run import FakeSystem, make_sequence
 from shifted_stamps import with_depth_stamps
 
 from bmask_slam.calibration.adoption import (
-    BENDS,
-    FREE,
     Estimate,
     SelfCalibration,
-    SelfCalibrationConfig,
     camera_with,
     format_found,
     judged,
     surely_other,
 )
 from bmask_slam.calibration.camera_check import CameraCheck
-from bmask_slam.calibration.priors import estimated_priors
+from bmask_slam.calibration.config import (
+    BENDS,
+    FREE,
+    SelfCalibrationConfig,
+    estimated_priors,
+)
 from bmask_slam.calibration.report import parameters_named
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import plot
@@ -202,6 +204,41 @@ def test_report_and_off_change_nothing(late_sweep: Path, quick: None, tmp_path: 
     assert trajectories[0] == trajectories[1]
     with pytest.raises(InputError, match="--calibrate on: is not one of auto, report, off"):
         dataclasses.replace(options, calibrate="on")
+
+
+def test_rows_that_are_read_upwards_are_noticed_and_used(
+    turned_sweep: Path, quick: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where images were turned by 180 degrees; also after a kill behind the new beginning."""
+    write, out, killed = checkpoint.write_checkpoint, tmp_path / "whole", tmp_path / "killed"
+
+    def copied(path: Path, content: checkpoint.Checkpoint) -> None:
+        write(path, content)
+        if content.calibration.rows and content.counters.frames == 40:
+            shutil.copytree(out, killed)
+
+    monkeypatch.setattr("bmask_slam.offline.checkpoint.write_checkpoint", copied)
+    found = run(late_options(turned_sweep, out))
+    monkeypatch.undo()
+    assert found.calibration.startswith("rows are read from the bottom up")
+    assert read_camera(out / "camera.yaml").rolling_shutter_s == -0.02
+    first = Run(out).events[0]
+    assert first.kind is EventKind.CALIBRATION and "from the bottom up" in first.text
+    with short_ends():
+        resumed = resume(killed, {"quiet": True})
+    assert resumed is not None and resumed.calibration == found.calibration
+    for name in ("trajectory.txt", "camera.yaml", "map", "graph", "events.csv"):
+        assert (killed / name).read_bytes() == (out / name).read_bytes(), name
+
+
+def test_rows_that_are_read_upwards_are_only_reported_if_asked(
+    turned_sweep: Path, quick: None, tmp_path: Path
+) -> None:
+    options = replace(late_options(turned_sweep, tmp_path / "r"), calibrate="report")
+    assert run(options).calibration == (
+        "rows are read from the bottom up, as in images turned by 180 degrees: found, not applied"
+    )
+    assert not (tmp_path / "r" / "camera.yaml").exists()
 
 
 @pytest.mark.parametrize(
