@@ -83,13 +83,15 @@ def accelerometer(
 def imu(T_world_camera: Array, hertz: float, config: ImuConfig, rng: np.random.Generator) -> Array:
     """Rows (N, 7) of an IMU at poses (N, 4, 4) of an even rate: rates and forces with their biases.
 
-    Rates are those from the pose before to the one after, forces the second differences of the
-    IMU's position, so that their integrals lead back to the poses.
+    Rates are those from the pose before to the one after (at the ends from or to the pose itself),
+    forces the second differences of the IMU's position, so that their integrals lead back to the
+    poses.
     """
     T = T_world_camera @ config.T_camera_imu
     R, p = T[:, :3, :3], T[:, :3, 3]
     padded = np.concatenate([R[:1], R, R[-1:]])
-    rates = so3_log(padded[:-2].mT @ padded[2:]) * hertz / 2
+    steps = np.r_[1, np.full(len(R) - 2, 2), 1]
+    rates = so3_log(padded[:-2].mT @ padded[2:]) * hertz / steps[:, None]
     p = np.concatenate([2 * p[:1] - p[1:2], p, 2 * p[-1:] - p[-2:-1]])
     force_world = np.diff(p, 2, axis=0) * hertz**2 + config.gravity_m_s2 * UP
     forces = (R.mT @ force_world[:, :, None])[:, :, 0]

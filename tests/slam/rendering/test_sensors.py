@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import inverse, se3_log
+from bmask_slam.graph.geometry import inverse, make_pose, se3_log, so3_exp
 from bmask_slam.graph.sensors.config import SensorsConfig
+from bmask_slam.graph.sensors.imu import ImuConfig
 from bmask_slam.graph.sensors.mounting import T_of
 from bmask_slam.graph.sensors.odometry import motion_between
 from bmask_slam.graph.sensors.streams import COLUMNS, SensorStreams, read_folder
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.rendering.config import RenderConfig
-from bmask_slam.rendering.sensors import GRAVITY_M_S2, POSITION_SIGMA_M, T_ENU_RENDERED
+from bmask_slam.rendering.sensors import GRAVITY_M_S2, POSITION_SIGMA_M, T_ENU_RENDERED, imu
 from bmask_slam.rendering.sequence import render_sequence
 
 CONFIG = RenderConfig("corridor", 31, fps=10.0, width=32, height=24, sensors=tuple(COLUMNS))
@@ -40,6 +41,15 @@ def test_the_sensors_of_a_rendered_sequence_fit_its_truth(tmp_path: Path) -> Non
     sensor = T_of(config.accelerometer.accelerometer_in_camera)[:3, :3]
     mean = np.mean((R_world[known, :3, :3] @ sensor @ force[known, 1:4, None])[:, :, 0], axis=0)
     np.testing.assert_allclose(mean, [0, 0, GRAVITY_M_S2], atol=0.4)
+
+
+def test_an_imu_that_turns_evenly_has_the_same_rate_from_first_to_last() -> None:
+    rate_rad_s, hertz = np.array([0.3, -0.2, 0.5]), 200.0
+    R = so3_exp(np.arange(20)[:, None] / hertz * rate_rad_s)
+    quiet = {name: 0.0 for name in vars(ImuConfig()) if name.startswith("sigma")}
+    config = replace(ImuConfig(imu_in_camera=(0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)), **quiet)
+    rows = imu(make_pose(R, np.zeros((20, 3))), hertz, config, np.random.default_rng(0))
+    np.testing.assert_allclose(rows[:, 1:4], np.tile(rate_rad_s, (20, 1)), atol=1e-9)
 
 
 def test_an_unknown_sensor_is_refused(tmp_path: Path) -> None:
