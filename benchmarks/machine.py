@@ -42,6 +42,19 @@ def describe_commit(written: tuple[str, ...]) -> str:
     return head if not changed else f"{head} with changes in {', '.join(changed)}"
 
 
+def resident_mb() -> float:
+    """Resident memory of this process now in MB (1e6 bytes)."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def own_mb(pid: int | str) -> float:
+    """Anonymous resident memory of a process in MB (1e6 bytes)."""
+    lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines()
+    anonymous = next(line.split() for line in lines if line.startswith("RssAnon"))
+    return int(anonymous[1]) * 1024 / 1e6
+
+
 def now() -> str:
     """Date and time in UTC."""
     return datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")

@@ -5,9 +5,12 @@ from __future__ import annotations
 import importlib
 import json
 import logging
+import os
 import re
+import signal
 import subprocess
 import sys
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import cv2
@@ -18,6 +21,8 @@ from repository import ROOT
 from benchmarks.cameras.mirrored import CHANGES, write_changed
 from benchmarks.cameras.orb_slam3 import settings_of
 from benchmarks.cameras.orb_vocabulary import lines_of, nearest
+from benchmarks.live.session import Rounds
+from benchmarks.machine import own_mb, resident_mb
 from benchmarks.pages import table, written_sections
 from benchmarks.paths import RESULTS
 from benchmarks.scale import day
@@ -26,15 +31,18 @@ from benchmarks.semantics.mounted import write_turned
 from benchmarks.semantics.real_rooms import ROOMS, score_objects
 from benchmarks.semantics.room_truth import centre_in, moved
 from benchmarks.suite import never_lost
+from benchmarks.suite.measure import in_own_process, stage_times
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
+from bmask_slam.run_folder.frame_file import read_frames
 from bmask_slam.run_folder.semantic_files import SavedObject
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
 from bmask_slam.sequences.cameras import read_camera, write_camera
 from bmask_slam.sequences.lists import read_lists
+from bmask_slam.sequences.sequence import open_sequence
 
 SCRIPTS = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
@@ -282,3 +290,47 @@ def test_orb_slam3_gets_the_camera_in_its_own_format() -> None:
     assert lines["Camera1.k3"] == "0.300000000"
     assert (lines["Camera.width"], lines["Camera.fps"]) == ("640", "30")
     assert float(lines["Stereo.b"]) == pytest.approx(camera.stereo_bf_px_m / camera.fx)
+
+
+def test_memory_is_told_in_the_same_megabytes_everywhere() -> None:
+    """Of the map's arrays and of its process, which stand beside each other: 1e6 bytes."""
+    before_mb, before_all_mb = own_mb("self"), resident_mb()
+    held = np.ones(150_000_000 // 8)
+    assert own_mb("self") - before_mb == pytest.approx(held.nbytes / 1e6, rel=0.02)
+    assert resident_mb() - before_all_mb == pytest.approx(held.nbytes / 1e6, rel=0.02)
+
+
+def _mortal(what: str) -> dict[str, float]:
+    if what == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {what: 1.0}
+
+
+def test_a_measurement_in_its_own_process_that_is_killed_ends_the_benchmark() -> None:
+    assert in_own_process(_mortal, "measured") == {"measured": 1.0}
+    with pytest.raises(BrokenProcessPool):
+        in_own_process(_mortal, "killed")
+
+
+def test_stages_of_keyframes_are_counted_over_keyframes(tmp_path: Path) -> None:
+    lines = ["index,timestamp,status,keyframe,tracking_ms,graph_ms", "0,0.0,OK,0,2.0,30.0"]
+    lines += ["1,0.1,OK,,4.0,0.0", "2,0.2,OK,1,6.0,50.0", "3,0.3,LOST,,,"]
+    (tmp_path / "frames.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    frames = read_frames(tmp_path / "frames.csv")
+    assert stage_times(frames, "tracking") == pytest.approx((4.0, 5.8, 3))
+    assert stage_times(frames, "graph") == pytest.approx((40.0, 49.0, 2))
+    assert stage_times(frames, "loops") == (0.0, 0.0, 0)
+
+
+def test_a_tour_shows_each_sequence_forward_and_backward(office: Path) -> None:
+    sequence, seen = open_sequence(office), list[None]()
+    tour = Rounds(
+        [sequence, sequence], 2 * len(sequence) + 2, 20.0, True, lambda: seen.append(None)
+    )
+    frames = list(tour.frames())
+    there = list(range(len(sequence)))
+    assert [index for _, index in tour.order] == 2 * (there + there[::-1])
+    assert [frame.timestamp_s for frame in frames] == pytest.approx(np.arange(len(frames)) / 20)
+    assert len(seen) == len(frames)
+    np.testing.assert_array_equal(frames[0].rgb, frames[2 * len(sequence) - 1].rgb)
+    np.testing.assert_array_equal(frames[1].rgb, frames[2 * len(sequence) + 1].rgb)

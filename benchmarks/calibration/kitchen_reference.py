@@ -148,7 +148,7 @@ def errors_by_reference(run: Path, folder: Path, sequence: Sequence) -> str:
 
 
 def open3d_odometry(sequence: Sequence) -> Trajectory:
-    """Every frame registered to the one before by colour and depth (Open3D's defaults)."""
+    """Every frame registered to the one before by colour and depth up to MAX_DEPTH_M."""
     o3d = load_open3d()
     odometry, camera = o3d.t.pipelines.odometry, sequence.camera
     K, start = o3d.core.Tensor(camera.K), o3d.core.Tensor(np.eye(4))

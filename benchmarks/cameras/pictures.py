@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from io import BytesIO
 from itertools import groupby
@@ -18,6 +17,7 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.hand_eye import body_trajectory, hand_eye
 from bmask_slam.graph.metrics import AbsoluteError, absolute_error
 from bmask_slam.graph.trajectory import Trajectory, associate, read_tum
+from bmask_slam.run_folder.reader import Run
 
 STATUS_COLOURS = {"WEAK": "#e8b54a", "LOST": "#8a2be2"}
 OTHER_COLOURS = ("#1f77b4", "#3a8f4d", "#7fbf7b", "#5b5b9f", "#9e9ac8")
@@ -55,10 +55,11 @@ def draw_sequence(wanted: Pictured, path: Path) -> None:
     aligned = error.alignment.apply(estimate)
     draw_top_view(figure.add_subplot(grid[:, 0]), aligned, truth, (error.aligned, reference))
     own, beside = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
-    stamps_s, status = _status(wanted.run)
+    frames = Run(wanted.run).frames
+    stamps_s = frames.timestamps_s
     begin_s = stamps_s[0]
     _draw_own(own, error, begin_s)
-    _draw_status(own, stamps_s - begin_s, status)
+    _draw_status(own, stamps_s - begin_s, frames.status)
     beside.plot(*_over_time(error, begin_s), color=DIFFERENCE, lw=1.4, label="bmask-slam")
     for (name, file), colour in zip(wanted.others.items(), OTHER_COLOURS, strict=False):
         _, other = _compared(file, truth, wanted.hand_eye)
@@ -110,14 +111,7 @@ def _draw_own(axes: Axes, error: AbsoluteError, begin_s: float) -> None:
     axes.grid(alpha=0.25, lw=0.5)
 
 
-def _status(run: Path) -> tuple[Array, list[str]]:
-    """Stamps (N,) and the status of all frames."""
-    with (run / "frames.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    return np.array([float(row["timestamp"]) for row in rows]), [row["status"] for row in rows]
-
-
-def _draw_status(axes: Axes, time_s: Array, status: list[str]) -> None:
+def _draw_status(axes: Axes, time_s: Array, status: tuple[str, ...]) -> None:
     """Shade where frames are WEAK or LOST, and say how many there are."""
     for wanted, colour in STATUS_COLOURS.items():
         axes.axvspan(0, 0, color=colour, alpha=0.5, lw=0,

@@ -16,7 +16,6 @@ and the others, which do not change with a commit, are measured only where they 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import re
 import shutil
@@ -51,6 +50,7 @@ from benchmarks.pages import WRITTEN, fill_block
 from benchmarks.paths import KITCHEN, ROOT, SHARED
 from benchmarks.suite.measure import call, render
 from bmask_slam.evaluation import evaluate
+from bmask_slam.run_folder.reader import Run
 
 FOLDERS = {
     "rpy": SHARED / "tum_fr1_rpy", "rpy-none": SHARED / "tum_fr1_rpy",
@@ -94,12 +94,10 @@ def measured(name: str, work: Path) -> Figures:
     where = [str(folder), "--out", str(out), "--overwrite", "--quiet"]
     call(["-m", "bmask_slam", "run", *where, *recording.options])
     whole_s = time.perf_counter() - start_s
-    rows = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
-    metrics = {row["name"]: row["value"] for row in rows}
-    with (out / "frames.csv").open(encoding="utf-8", newline="") as file:
-        status = [row["status"] for row in csv.DictReader(file)]
-    log = (out / "log.txt").read_text(encoding="utf-8")
-    said = "; ".join(preset or found for preset, found in SAID.findall(log))
+    run = Run(out)
+    metrics = {name: metric.value for name, metric in run.metrics.items()}
+    status = run.frames.status
+    said = "; ".join(preset or found for preset, found in SAID.findall("\n".join(run.log)))
     return Figures(
         name, OURS, len(status), metrics["tracked_share"], status.count("WEAK") / len(status),
         **_errors(name, out, work), median_ms=metrics["tracking_ms_median"],
@@ -139,7 +137,10 @@ def orb_slam3_median(name: str, out: Path, work: Path) -> str:
 
 
 def _errors(name: str, out: Path, work: Path) -> dict[str, Any]:
-    """ATE and RPE a second in metres, and the ATE by hand-eye where the reference needs that."""
+    """ATE and RPE a second in metres; where the reference needs that, also the ATE by hand-eye.
+
+    The RPE is by hand-eye then, too.
+    """
     reference = FOLDERS["rpy"] if name == "rpy-unknown" else folder_of(name, work)
     path = out / "trajectory.txt"
     errors = evaluate(path, reference)

@@ -67,7 +67,8 @@ class Figures:
     Attributes:
         name: of RECORDINGS.
         tracked, weak: shares of frames.
-        ate_m, hand_eye_m, rpe_m: RMSE; of hand_eye_m with the place of the reference found.
+        ate_m, hand_eye_m, rpe_m: RMSE; of hand_eye_m with the place of the reference found, and
+            of rpe_m where there is a hand_eye_m.
         median_ms, high_ms: a frame's time, 95 % of the frames take less than the second; of a
             library the processor's time, which a busy machine does not change.
         whole_s: of the process, reading and writing too.

@@ -18,9 +18,8 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from benchmarks.graph.graph_growth import CAMERA, Feeder
+from benchmarks.graph.graph_growth import Feeder, run
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.factors.graph_estimate import GraphEstimate
 from bmask_slam.graph.factors.graph_update import GraphUpdate
 from bmask_slam.graph.geometry import adjoint, inverse, se3_log
 from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
@@ -42,11 +41,8 @@ def session(
     arguments = argparse.Namespace(
         keyframes=150, observations=150, landmarks=3000, cull=cull, seed=seed
     )
-    feeder, smoother = Feeder(arguments), Smoother(CAMERA, config)
-    estimate: GraphEstimate | None = None
-    for k in range(keyframes):
-        estimate = smoother.update(feeder.update(k, estimate))
-    return feeder, smoother
+    feeder = Feeder(arguments)
+    return feeder, run(feeder, keyframes, config)[0]
 
 
 def one_room(seed: int) -> dict[str, float]:

@@ -49,7 +49,6 @@ class Feeder:
         self.points = walls(args.landmarks, self.rng)
         self.per_keyframe, self.cull = args.observations, args.cull
         self.known: Ints = np.zeros(0, np.int64)
-        self.T_last_error = np.eye(4)
 
     def update(self, k: int, estimate: GraphEstimate | None) -> GraphUpdate:
         """The update of keyframe k; its initial pose carries the last one's error and more."""
@@ -101,14 +100,14 @@ class Feeder:
         return self.rng.choice(estimate.landmark_ids, self.cull, replace=False)
 
 
-def run(args: argparse.Namespace, config: SmootherConfig) -> tuple[Smoother, list[GraphEstimate]]:
-    """Every update's estimate (arrays of all but the last are dropped)."""
-    feeder, smoother = Feeder(args), Smoother(CAMERA, config)
-    estimates: list[GraphEstimate] = []
-    last = None
-    for k in range(args.keyframes):
-        last = smoother.update(feeder.update(k, last))
-        estimates.append(last)
+def run(
+    feeder: Feeder, keyframes: int, config: SmootherConfig
+) -> tuple[Smoother, list[GraphEstimate]]:
+    """The smoother after the first keyframes of a feeder, and every update's estimate."""
+    smoother, estimates = Smoother(CAMERA, config), list[GraphEstimate]()
+    for k in range(keyframes):
+        last = estimates[-1] if estimates else None
+        estimates.append(smoother.update(feeder.update(k, last)))
     return smoother, estimates
 
 
@@ -150,7 +149,7 @@ def main() -> None:
     names = ("relinearize_threshold", "relinearize_skip", "extra_iterations")
     given = {n: getattr(args, n) for n in names if getattr(args, n) is not None}
     config = dataclasses.replace(SmootherConfig(), **given)
-    smoother, estimates = run(args, config)
+    smoother, estimates = run(Feeder(args), args.keyframes, config)
     report(smoother, estimates, walk(args.keyframes))
 
 

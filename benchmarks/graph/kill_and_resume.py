@@ -66,7 +66,7 @@ def kill_once(
     """A run that is killed after so many seconds and then resumed."""
     shutil.rmtree(out, ignore_errors=True)
     process = program(*options, "--out", out)
-    while not (out / "checkpoint").exists():
+    while not (out / "checkpoint").exists() and process.poll() is None:
         time.sleep(0.01)
     try:
         process.wait(after_s)

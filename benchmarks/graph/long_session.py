@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import sys
 import time
 from pathlib import Path
@@ -31,6 +30,7 @@ from bmask_slam.graph.factors.graph_estimate import GraphEstimate
 from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, RelativePose
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.smoother.smoother import Smoother
+from bmask_slam.runtime.memory import peak_rss_mb
 
 SIGMAS_PX = np.array([1.0, 1.0, 0.2])
 """Of u, v and disparity, as in the red kitchen (docs/architecture.md)."""
@@ -171,11 +171,6 @@ def session(
     sys.stderr.write("\n")
     assert estimate is not None
     return smoother, front, estimate, np.array(rows)
-
-
-def peak_rss_mb() -> float:
-    """Peak resident memory of this process so far in MB (1e6 bytes)."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
 def quarters(rows: Array) -> list[dict[str, float]]:

@@ -11,12 +11,11 @@ patches, normals and ghosts are those of `benchmarks.mapping.surface_compare`.
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import resource
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +26,10 @@ from benchmarks.mapping.surface_compare import (
     flat_patches,
     ghosts,
     patch_errors,
-    table,
+    table_of,
     truth_errors,
 )
+from benchmarks.suite.measure import in_own_process
 from bmask_slam.config.configuration import resolve
 from bmask_slam.dense.growing.frames import FrameOptions
 from bmask_slam.dense.map_run import map_run
@@ -48,14 +48,14 @@ WITHIN_M = 0.02
 
 
 def live(
-    sequence: str, frames: int, out: Path, per_s: float | None, realtime: bool, send: Any
-) -> None:
+    sequence: str, frames: int, out: Path, per_s: float | None, realtime: bool
+) -> dict[str, float]:
     """A live run; processor time of tracking for each frame, and how the surface grew."""
     options = LiveOptions(
         out, True, images=Path(sequence), dense=per_s is not None, straightens=True
     )
     if per_s is not None:
-        options = LiveOptions(**{**vars(options), "surface_frames": FrameOptions(per_s)})
+        options = replace(options, surface_frames=FrameOptions(per_s))
     source = open_source(sequence, SourceOptions(realtime=realtime, max_frames=frames))
     with LiveSlam(source.camera, resolve(SystemConfig, None, SEGMENTER), options) as slam:
         begin_s, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF)
@@ -71,18 +71,7 @@ def live(
     row |= {"played s": played_s, "dense cpu s": dense_s}
     row |= {"by then": health.surface_frames}
     row |= {"in the end": 0 if slam.dense is None else slam.dense.frames}
-    send.send(row | {"dropped": health.surface_frames_dropped, "finish s": ended_s})
-
-
-def in_own_process(*arguments: Any) -> dict[str, float]:
-    """What ``live`` measures, in a new process."""
-    context = multiprocessing.get_context("spawn")
-    receive, send = context.Pipe(duplex=False)
-    process = context.Process(target=live, args=(*arguments, send))
-    process.start()
-    found: dict[str, float] = receive.recv()
-    process.join()
-    return found
+    return row | {"dropped": health.surface_frames_dropped, "finish s": ended_s}
 
 
 def cloud(run: Path) -> dict[str, NDArray]:
@@ -129,12 +118,12 @@ def main() -> None:
         for k in range(args.repeat):
             out = args.work / f"{Path(args.sequence).name}-{name.replace(' ', '-')}-{k}"
             rows[f"{name}, {k}"] = in_own_process(
-                args.sequence, args.frames, out, per_s, args.realtime
+                live, args.sequence, args.frames, out, per_s, args.realtime
             )
         if per_s is not None and not args.costs:
             surfaces |= {f"{name}, {what}": row for what, row in quality(out, args.truth)}
     title = Path(args.sequence).name
-    print("\n".join([*table(title, rows), *(table(title, surfaces) if surfaces else [])]))
+    print(*(table_of(title, found) for found in (rows, surfaces) if found), sep="\n")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.live.session import own_mb
+from benchmarks.machine import own_mb
 from bmask_slam.config.configuration import resolve
 from bmask_slam.live.replica import DeltaMaker, apply_delta
 from bmask_slam.runtime.memory import give_back_memory

@@ -176,22 +176,10 @@ class Player:
 
     def run(self, first: int, frames: int, *more: str) -> subprocess.Popen[str]:
         """Play some frames."""
-        words = [
-            sys.executable,
-            "-m",
-            "benchmarks.live.ros2",
-            self.options.sequence,
-            "--play",
-            first,
-            "--frames",
-            frames,
-            "--rate",
-            self.options.rate,
-            "--domain",
-            self.domain,
-            *more,
-        ]
-        return subprocess.Popen(list(map(str, words)), stdout=subprocess.PIPE, text=True)
+        what = f"--play {first} --frames {frames} --rate {self.options.rate} --domain {self.domain}"
+        words = [sys.executable, "-m", "benchmarks.live.ros2", str(self.options.sequence)]
+        words += [*what.split(), *more]
+        return subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
 
     def stop(self, process: subprocess.Popen[str], kill: bool) -> None:
         """Kill it, or wait for its end; the stamps are kept."""
@@ -206,20 +194,8 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     os.environ.setdefault("CYCLONEDDS_URI", LOOPBACK)
     domain = options.domain or 100 + os.getpid() % 100
     out = options.out / f"ros2-{options.sequence.name}"
-    command = [
-        sys.executable,
-        "-m",
-        "bmask_slam",
-        "live",
-        f"ros2:{domain}",
-        "--out",
-        str(out),
-        "--overwrite",
-        "--quiet",
-        "--silence",
-        str(QUIET_S),
-        *options.live,
-    ]
+    command = [sys.executable, "-m", "bmask_slam", "live", f"ros2:{domain}", "--out", str(out)]
+    command += ["--overwrite", "--quiet", "--silence", str(QUIET_S), *options.live]
     node, player = DdsNode(domain), Player(options, domain)
     readers = {topic: node.reader(topic, type_name(k), q) for topic, (k, q) in HEARD.items()}
     heard: dict[str, list[float]] = defaultdict(list)
@@ -297,13 +273,9 @@ def main() -> None:
     parser.add_argument("--hold", action="store_true", help="with --play: that frame all the time")
     parser.add_argument("--make-bag", type=Path, metavar="BAG", help="folder of a bag to make")
     words = sys.argv[1:]
-    own, live = (
-        (words[: words.index("--")], words[words.index("--") + 1 :])
-        if "--" in words
-        else (words, [])
-    )
-    options = parser.parse_args(own)
-    options.live = live
+    cut = words.index("--") if "--" in words else len(words)
+    options = parser.parse_args(words[:cut])
+    options.live = words[cut + 1 :]
     if options.play is not None:
         play(options)
     else:

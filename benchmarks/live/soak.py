@@ -21,22 +21,19 @@ import os
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.live.session import PARTS, own_mb
-from bmask_slam.graph.trajectory import Trajectory
+from benchmarks.live.session import PARTS, Rounds
+from benchmarks.machine import own_mb
+from bmask_slam.config.configuration import resolve
 from bmask_slam.live.health import Health
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.play import PlayOptions, play
-from bmask_slam.live.sources.source import MeasuredSource, SourceCounts, paced
-from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
-from bmask_slam.sequences.frame import Frame
-from bmask_slam.sequences.sequence import Sequence, open_sequence
+from bmask_slam.sequences.sequence import open_sequence
 from bmask_slam.system_config import SystemConfig
 
 SAMPLES = 120
@@ -101,41 +98,6 @@ CURVES = (
     *("tracking_descriptors", "map_descriptors", "keyframes", "landmarks"),
 )
 """Whose slope is printed."""
-
-
-Watch = Callable[[], None]
-
-
-class Rounds(MeasuredSource):
-    """Sequences that are played forward and backward again and again, at the rate of a camera."""
-
-    name = "rounds"
-
-    def __init__(
-        self, sequences: list[Sequence], frames: int, hz: float, waits: bool, watch: Watch
-    ):
-        self.waits = waits
-        self.camera = sequences[0].camera
-        self.groundtruth: Trajectory | None = None
-        self.counts = SourceCounts()
-        self._sequences, self._frames, self._hz, self._watch = sequences, frames, hz, watch
-
-    def frames(self) -> Iterator[Frame]:
-        """Each frame when it is due, with the stamp that the camera would give it."""
-        return self._unpaced() if self.waits else paced(self._unpaced())
-
-    def close(self) -> None:
-        """Nothing to close."""
-
-    def _unpaced(self) -> Iterator[Frame]:
-        order = []
-        for sequence in self._sequences:
-            there = range(len(sequence))
-            order += [(sequence, index) for index in (*there, *reversed(there))]
-        for k in range(self._frames):
-            sequence, index = order[k % len(order)]
-            self._watch()
-            yield replace(sequence.load(index), index=k, timestamp_s=k / self._hz)
 
 
 def descriptors(pid: int | str) -> int:
@@ -264,9 +226,8 @@ def main() -> None:
     parser.add_argument("--table", type=Path, help="all samples, .csv")
     arguments = parser.parse_args()
     sequences = [open_sequence(path) for path in arguments.sequences]
-    config = SystemConfig()
-    chosen = SegmenterOptions(arguments.segmenter)
-    config = replace(config, semantics=replace(config.semantics, segmenter=chosen))
+    chosen = f"semantics.segmenter.name={arguments.segmenter}"
+    config = resolve(SystemConfig, None, (chosen,))
     frames, begin_s = int(60 * arguments.minutes * arguments.hz), time.monotonic()
     with tempfile.TemporaryDirectory() as scratch:
         options = LiveOptions(Path(scratch) / "run")

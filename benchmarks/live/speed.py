@@ -20,8 +20,6 @@ FOLDER (``make typing`` in its checkout makes one: build/typing).
 from __future__ import annotations
 
 import argparse
-import csv
-import json
 import os
 import resource
 import subprocess
@@ -35,6 +33,7 @@ import numpy as np
 
 from benchmarks.machine import features_ms
 from benchmarks.paths import KITCHEN, ROOT
+from bmask_slam.run_folder.reader import Run
 
 NAME = 28
 COLUMNS = (
@@ -68,9 +67,8 @@ def measured(command: list[str], out: Path, before: Path | None = None) -> dict[
     wall_s, cpu_s = time.perf_counter() - start_s, _children_s() - used_s
     if done.returncode:
         raise SystemExit(f"error: {' '.join(command)} failed:\n{done.stderr.strip()[-2000:]}")
-    found = {row["name"]: row["value"] for row in json.loads((out / "metrics.json").read_text())}
-    with (out / "frames.csv").open(encoding="utf-8", newline="") as file:
-        frames = sum(1 for _ in csv.DictReader(file))
+    found = {name: metric.value for name, metric in Run(out).metrics.items()}
+    frames = len(Run(out).frames)
     found |= {"whole_per_second": frames / wall_s, "cpu_ms": 1e3 * cpu_s / frames}
     found["per_orb"] = found["tracking_ms_median"] / features_ms(
         cv2.ORB_create(ORB_KEYPOINTS), Path(command[1])

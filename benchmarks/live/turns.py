@@ -11,7 +11,6 @@ processes on one core. ``--before``: beside other code, as for `benchmarks.live.
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import tempfile
 from pathlib import Path
@@ -19,6 +18,7 @@ from pathlib import Path
 from benchmarks.cameras.mirrored import CHANGES, write_changed
 from benchmarks.live.speed import measured
 from benchmarks.paths import SHARED
+from bmask_slam.run_folder.reader import Run
 
 NAME = 34
 
@@ -26,8 +26,7 @@ NAME = 34
 def repeat(sequence: Path, out: Path, code: Path | None) -> tuple[int, int, float]:
     """Frames lost and dropped, and the ATE in millimetres, of one run by this code or other."""
     found = measured(["live", str(sequence), "--realtime"], out, code)
-    with (out / "frames.csv").open(encoding="utf-8", newline="") as file:
-        lost = sum(row["status"] == "LOST" for row in csv.DictReader(file))
+    lost = Run(out).frames.status.count("LOST")
     return lost, int(found["frames_dropped"]), 1e3 * found["ate_rmse"]
 
 

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
+from benchmarks.pages import table
 from benchmarks.paths import KITCHEN, ROOT, SHARED
 from benchmarks.suite.measure import render
 from bmask_slam.config.configuration import resolve
@@ -290,37 +291,36 @@ def measure(names: list[str], work: Path) -> None:
         path.write_text(json.dumps(kept, indent=1), encoding="utf-8")
 
 
-def table(work: Path) -> str:
+def tables(work: Path) -> str:
     """The two tables in Markdown."""
     kept = json.loads((work / "loops" / "results.json").read_text(encoding="utf-8"))
-    lines = [
-        "| | candidates | refused by verification (same place) | refused for drift (right ones) | "
-        "closed (wrong ones) | NEES (95 % band) | noise ratio | ATE with, without loops (mm) |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    header = (
+        *("", "candidates", "refused by verification (same place)"),
+        *("refused for drift (right ones)", "closed (wrong ones)", "NEES (95 % band)"),
+        *("noise ratio", "ATE with, without loops (mm)"),
+    )
+    rows = []
     for name in folders(work):
         if name in kept:
             row = Row(**kept[name]["row"])
             honest = f"{row.nees:.2f} ({band(row.verified)})" if np.isfinite(row.nees) else ""
             by = ", by hand-eye" if name in ONLY_BY_HAND_EYE else ""
-            lines.append(
-                f"| {name}{by} | {row.candidates} | {row.refused} ({row.same_place}) | "
-                f"{row.drift} ({row.drift_right}) | {row.closed} ({row.wrong}) | {honest} | "
-                f"{row.ratio:.1f} | {1e3 * row.ate_m:.2f}, {1e3 * row.without_m:.2f} |"
-            )
-    lines += [
-        "",
-        "| two halves | edges | noise ratio | NEES against the truth | against the maps | band |",
-        "|---|---|---|---|---|---|",
-    ]
+            rows.append((
+                f"{name}{by}", f"{row.candidates}", f"{row.refused} ({row.same_place})",
+                f"{row.drift} ({row.drift_right})", f"{row.closed} ({row.wrong})", honest,
+                f"{row.ratio:.1f}", f"{1e3 * row.ate_m:.2f}, {1e3 * row.without_m:.2f}",
+            ))  # fmt: skip
+    halved = []
     for name in HALVED:
         if "halves" in kept.get(name, {}):
             half = Halves(**kept[name]["halves"])
-            lines.append(
-                f"| {name} | {half.edges} | {half.ratio:.1f} | {half.nees_truth:.2f} | "
-                f"{half.nees_maps:.2f} | {band(half.edges)} |"
-            )
-    return "\n".join(lines)
+            numbers = (f"{x:.2f}" for x in (half.nees_truth, half.nees_maps))
+            halved.append((name, f"{half.edges}", f"{half.ratio:.1f}", *numbers, band(half.edges)))
+    of_halves = (
+        *("two halves", "edges", "noise ratio"),
+        *("NEES against the truth", "against the maps", "band"),
+    )
+    return f"{table(header, rows)}\n\n{table(of_halves, halved)}"
 
 
 def main() -> None:
@@ -332,7 +332,7 @@ def main() -> None:
     given = parser.parse_args()
     if not given.report_only:
         measure(given.names or list(folders(given.work)), given.work)
-    print(table(given.work))
+    print(tables(given.work))
 
 
 if __name__ == "__main__":

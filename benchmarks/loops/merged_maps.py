@@ -106,11 +106,7 @@ def run_on(name: str, folder: Path) -> Path:
 
 def ate_m(trajectory: Trajectory, truth: Trajectory) -> float:
     """ATE (RMSE) in metres."""
-    return next(
-        float(r["value"])
-        for r in evaluate_trajectory(trajectory, truth).rows
-        if r["name"] == "ate_rmse"
-    )
+    return evaluate_trajectory(trajectory, truth).value("ate_rmse")
 
 
 def joint_truth(merged: Path, folder: Path) -> Trajectory:
@@ -141,7 +137,9 @@ def main() -> None:
         print(f"{name}: {merged.metrics[name].value:g} {merged.metrics[name].unit}")
     for name in ROOMS:
         try:
-            bmask_slam.merge_runs(runs[0], run_on(name, folder), out=folder / "wrong")
+            bmask_slam.merge_runs(
+                runs[0], run_on(name, folder), out=folder / "wrong", overwrite=True
+            )
             print(f"{name}: merged, which is wrong")
         except bmask_slam.InputError as error:
             print(f"{name}: refused: {error}")

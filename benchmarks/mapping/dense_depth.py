@@ -70,21 +70,23 @@ class Steps:
 
     def fused(self, maps: list[Map], count: int = 6) -> list[Fused]:
         """Step 4 with so many neighbours."""
-        index = {k.id: i for i, k in enumerate(self.keyframes)}
-        results = []
-        for i, own in enumerate(self.keyframes):
-            window = [k for k in self.keyframes[max(i - 6, 0) : i + 7] if k is not own]
-            T_own_world = inverse(own.T_world_camera)
-            views = [
-                View(
-                    maps[index[k.id]],
-                    T_own_world @ k.T_world_camera,
-                    self.images[index[k.id]].float(),
-                )
-                for k in choose_neighbours(own, window, count)
-            ]
-            results.append(fuse(maps[i], views, self.camera, self.images[i].float()))
-        return results
+        return [
+            fuse(maps[i], self.views(i, maps, count), self.camera, self.images[i].float())
+            for i in range(len(self.keyframes))
+        ]
+
+    def views(self, i: int, maps: list[Map], count: int = 6) -> list[View]:
+        """The maps of the ``i``-th keyframe's neighbours as it sees them."""
+        index = {k.id: n for n, k in enumerate(self.keyframes)}
+        own = self.keyframes[i]
+        window = [k for k in self.keyframes[max(i - 6, 0) : i + 7] if k is not own]
+        T_own_world = inverse(own.T_world_camera)
+        return [
+            View(
+                maps[index[k.id]], T_own_world @ k.T_world_camera, self.images[index[k.id]].float()
+            )
+            for k in choose_neighbours(own, window, count)
+        ]
 
 
 def without_patches(keyframe: DenseKeyframe, lost: float) -> DenseKeyframe:

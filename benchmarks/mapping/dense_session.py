@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.machine import resident_mb
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.keyframe_input import undistort_images
 from bmask_slam.graph.arrays import Array
@@ -60,7 +61,8 @@ def session(sequence: Sequence, count: int) -> Iterator[str]:
     with tempfile.TemporaryDirectory() as temporary:
         folder = DenseFolder(Path(temporary), {})
         mapper = DenseMapper(sequence.camera)
-        yield f"keyframes  memory MB  in use MB  ms a keyframe  (memory before: {rss_mb():.0f} MB)"
+        before = f"(memory before: {resident_mb():.0f} MB)"
+        yield f"keyframes  memory MB  in use MB  ms a keyframe  {before}"
         fused_s = 0.0
         for number in range(count):
             lap, step = divmod(number, len(true))
@@ -75,14 +77,15 @@ def session(sequence: Sequence, count: int) -> Iterator[str]:
             fused_s += time.perf_counter() - started_s
             if (number + 1) % (count // 6) == 0:
                 keyframe_ms = 1e3 * fused_s / (count // 6)
-                yield f"{number + 1:9} {rss_mb():10.0f} {in_use_mb():10.0f} {keyframe_ms:14.0f}"
+                sizes = f"{resident_mb():10.0f} {in_use_mb():10.0f}"
+                yield f"{number + 1:9} {sizes} {keyframe_ms:14.0f}"
                 fused_s = 0.0
         _save(mapper.flush(), folder)
         started_s = time.perf_counter()
         points = _write_cloud(folder, poses, sequence.camera)
         wall_s = time.perf_counter() - started_s
         size_mb = sum(f.stat().st_size for f in folder.path.rglob("*") if f.is_file()) / 1e6
-        yield f"surface of {points} vertices: {wall_s:.0f} s, {rss_mb():.0f} MB"
+        yield f"surface of {points} vertices: {wall_s:.0f} s, {resident_mb():.0f} MB"
         yield f"most memory at any time: {peak_rss_mb():.0f} MB; on disk {size_mb:.0f} MB"
 
 
@@ -97,12 +100,6 @@ def _write_cloud(folder: DenseFolder, poses: list[Array], camera: Camera) -> int
     for k, T in enumerate(poses):
         volume.integrate(depth_frame(folder.fused(k), folder.colours(k), T, camera, VOXEL_M))
     return len(extract(volume, 1).vertices)
-
-
-def rss_mb() -> float:
-    """Memory that the process holds."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * 4096 / 1e6
 
 
 class _HeapState(ctypes.Structure):

@@ -83,20 +83,25 @@ def surface(truths: list[Truth], run: MappedRun, max_depth_m: float = 5.0) -> di
     return {"points": p[kept], "normals": n[kept], "labels": label[kept]}
 
 
-def surface_errors(points: Array, true: dict[str, Any]) -> dict[str, float]:
-    """Distance to the true surface along its normal, and the F-score at 1 cm."""
+def thinned(points: Array, edge_m: float) -> Array:
+    """One of the points (N, 3) in each voxel of this edge."""
+    flat = points.astype(np.float32)
+    return points[surest_per_voxel(flat, np.zeros(len(flat), np.float32), edge_m)]
+
+
+def distances_m(points: Array, true: dict[str, Any]) -> Array:
+    """Distances (N,) of points (N, 3) to the true surface, along its normal where it is near."""
     distance, index = cKDTree(true["points"]).query(points, workers=1)
     offset = points - true["points"][index]
     along = np.abs(np.einsum("ij,ij->i", offset, true["normals"][index]))
-    near = distance < 3 * VOXEL_M
-    error = np.where(near, along, distance)
+    return np.where(distance < 3 * VOXEL_M, along, distance)
+
+
+def surface_errors(points: Array, true: dict[str, Any]) -> dict[str, float]:
+    """Distance to the true surface along its normal, and the F-score at 1 cm."""
+    error = distances_m(points, true)
     precision = float(np.mean(error < F_SCORE_M))
-    thin = true["points"][
-        surest_per_voxel(
-            true["points"].astype(np.float32), np.zeros(len(true["points"]), np.float32), VOXEL_M
-        )
-    ]
-    back, index = cKDTree(points).query(thin, workers=1)
+    back, _ = cKDTree(points).query(thinned(true["points"], VOXEL_M), workers=1)
     recall = float(np.mean(back < F_SCORE_M))
     return {
         "points": len(points),

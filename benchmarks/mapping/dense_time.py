@@ -13,17 +13,11 @@ import torch
 from benchmarks.mapping.dense_depth import Map, Steps
 from benchmarks.mapping.dense_surface import VOXEL_M, open3d_points
 from bmask_slam.dense.saved_map import MappedRun
-from bmask_slam.graph.geometry import inverse
 from bmask_slam.mapping.inverse_depth.backprojection import back_project, surface_normals
-from bmask_slam.mapping.inverse_depth.dense_mapper import (
-    DenseConfig,
-    FusedKeyframe,
-    choose_neighbours,
-)
+from bmask_slam.mapping.inverse_depth.dense_mapper import DenseConfig, FusedKeyframe
 from bmask_slam.mapping.inverse_depth.depth_map import from_sensor
 from bmask_slam.mapping.inverse_depth.fusion import Fused, fuse, with_calibrated_variance
 from bmask_slam.mapping.inverse_depth.regularisation import regularise
-from bmask_slam.mapping.inverse_depth.warping import View
 from bmask_slam.mapping.products.submaps import make_submap
 
 ROUNDS = 6
@@ -71,17 +65,10 @@ class _Single:
 
     def __init__(self, steps: Steps, run: MappedRun, config: DenseConfig) -> None:
         i = len(steps.keyframes) // 2
-        own = steps.keyframes[i]
-        index = {k.id: n for n, k in enumerate(steps.keyframes)}
-        window = [k for k in steps.keyframes[max(i - 6, 0) : i + 7] if k is not own]
-        T = inverse(own.T_world_camera)
-        maps = [regularise(m) for m in steps.raw]
-        self._own, self._camera, self._measurement = own, run.camera, config.measurement
+        self._own, self._camera = steps.keyframes[i], run.camera
+        self._measurement = config.measurement
         self._image = steps.images[i].float()
-        self._views = [
-            View(maps[index[k.id]], T @ k.T_world_camera, steps.images[index[k.id]].float())
-            for k in choose_neighbours(own, window, 6)
-        ]
+        self._views = steps.views(i, [regularise(m) for m in steps.raw])
 
     def works(self) -> dict[str, Callable[[], Any]]:
         """Each Step alone, and the submap that is made of what they give."""

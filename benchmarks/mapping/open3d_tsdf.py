@@ -1,4 +1,4 @@
-"""A triangle mesh from fused depth by Open3D's truncated signed distance volume."""
+"""Open3D's truncated signed distance volume of depth images."""
 
 from __future__ import annotations
 

@@ -19,7 +19,6 @@ the true surface, and the share of that which has a vertex within 2 and 5 cm.
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import resource
 import shutil
 import sys
@@ -35,10 +34,17 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from benchmarks.mapping.dense_surface import VOXEL_M, read_truth, surface
+from benchmarks.mapping.dense_surface import (
+    VOXEL_M,
+    distances_m,
+    read_truth,
+    surface,
+    thinned,
+)
 from benchmarks.mapping.open3d_tsdf import DepthView, integrated
+from benchmarks.pages import table
 from benchmarks.paths import SHARED
-from benchmarks.suite.measure import call, render
+from benchmarks.suite.measure import call, in_own_process, render
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.keyframe_input import load_keyframe, undistort_images
 from bmask_slam.dense.map_run import map_run, open_fusion
@@ -48,7 +54,6 @@ from bmask_slam.dense.surface import tracked_frames
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.mapping.open3d_loader import load_open3d
-from bmask_slam.mapping.products.submaps import surest_per_voxel
 from bmask_slam.mapping.products.surface_labels import dilate
 from bmask_slam.runtime.memory import peak_rss_mb
 
@@ -113,24 +118,12 @@ def _save(path: Path, out: Path) -> None:
     np.savez(out, t=np.asarray(mesh.triangles), **arrays)
 
 
-def _measured(method: str, run: Path, out: Path, send: Any) -> None:
+def run_method(method: str, run: Path, out: Path) -> dict[str, float]:
+    """Make a mesh; wall and processor time of this process in s, its memory in MB."""
     started_s = time.perf_counter()
     METHODS[method](run, out)
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    processor_s = used.ru_utime + used.ru_stime
-    send.send((time.perf_counter() - started_s, processor_s, peak_rss_mb()))
-
-
-def run_method(method: str, run: Path, out: Path) -> dict[str, float]:
-    """Make a mesh in a process of its own; wall and processor time in s, memory in MB."""
-    context = multiprocessing.get_context("spawn")
-    receive, send = context.Pipe(False)
-    process = context.Process(target=_measured, args=(method, run, out, send))
-    process.start()
-    process.join()
-    if process.exitcode:
-        raise SystemExit(f"{method} failed on {run}")
-    return dict(zip(("wall s", "cpu s", "MB"), receive.recv(), strict=True))
+    wall_s, used = time.perf_counter() - started_s, resource.getrusage(resource.RUSAGE_SELF)
+    return {"wall s": wall_s, "cpu s": used.ru_utime + used.ru_stime, "MB": peak_rss_mb()}
 
 
 def flat_patches(run: MappedRun) -> list[tuple[Array, Array]]:
@@ -226,12 +219,7 @@ def fused_points(run: MappedRun) -> Array:
         known = np.isfinite(depth_m) & (depth_m < 5)
         points = run.camera.backproject(np.stack([u, v], -1)[known], depth_m[known])
         parts.append(transform(keyframe.T_world_camera, points))
-    return _thinned(np.concatenate(parts), 2 * VOXEL_M)
-
-
-def _thinned(points: Array, edge_m: float) -> Array:
-    flat = points.astype(np.float32)
-    return points[surest_per_voxel(flat, np.zeros(len(flat), np.float32), edge_m)]
+    return thinned(np.concatenate(parts), 2 * VOXEL_M)
 
 
 def coverage(mesh: dict[str, NDArray], points: Array, limit_m: float) -> float:
@@ -241,12 +229,7 @@ def coverage(mesh: dict[str, NDArray], points: Array, limit_m: float) -> float:
 
 def truth_errors(mesh: dict[str, NDArray], true: dict[str, Any]) -> dict[str, float]:
     """Distance of the vertices to the true surface in mm, along its normal where they are near."""
-    tree = cKDTree(true["points"])
-    distance, index = tree.query(mesh["v"])
-    offset = mesh["v"] - true["points"][index]
-    along = np.abs((offset * true["normals"][index]).sum(axis=1))
-    error = np.where(distance < 3 * VOXEL_M, along, distance)
-    points = _thinned(true["points"], VOXEL_M)
+    error, points = distances_m(mesh["v"], true), thinned(true["points"], VOXEL_M)
     return {
         "mean mm": 1e3 * float(error.mean()),
         "95 % mm": 1e3 * float(np.quantile(error, 0.95)),
@@ -265,7 +248,7 @@ def measure(
     patches, points = flat_patches(run), None
     for name in methods:
         file = out / f"{run_path.name}-{name.replace(', ', '-')}.npz"
-        used = run_method(name, run_path, file)
+        used = in_own_process(run_method, name, run_path, file)
         mesh = dict(np.load(file))
         points = fused_points(run) if points is None else points
         row = patch_errors(mesh, patches)
@@ -280,14 +263,11 @@ def measure(
     return rows
 
 
-def table(title: str, rows: dict[str, dict[str, float]]) -> Iterator[str]:
+def table_of(title: str, rows: dict[str, dict[str, float]]) -> str:
     """The rows as Markdown."""
     names = list(next(iter(rows.values())))
-    yield f"| {title} | " + " | ".join(names) + " |"
-    yield "|---" * (len(names) + 1) + "|"
-    for method, row in rows.items():
-        yield f"| {method} | " + " | ".join(f"{row[n]:.4g}" for n in names) + " |"
-    yield ""
+    cells = ((method, *(f"{row[n]:.4g}" for n in names)) for method, row in rows.items())
+    return f"{table((title, *names), cells)}\n"
 
 
 def runs_of(work: Path) -> list[str]:
@@ -319,7 +299,7 @@ def main() -> None:
     for given in args.runs or runs_of(args.work):
         path, _, true = given.partition("=")
         rows = measure(Path(path), out, args.methods.split(";"), bool(true))
-        print("\n".join(table(Path(path).name, rows)), flush=True)
+        print(table_of(Path(path).name, rows), flush=True)
 
 
 if __name__ == "__main__":

@@ -58,7 +58,7 @@ def composed(
 
     Args:
         frame: of the recording.
-        man: a frame of the pairs; the pixels of its mask are used.
+        person: a frame of the pairs; the pixels of its mask are used.
         place_camera: the person's centre.
         focal_px: focal length and centre column of the recording's camera.
     """

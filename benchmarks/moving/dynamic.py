@@ -16,7 +16,6 @@ by moving objects.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -38,6 +37,7 @@ from bmask_slam.moving.static_features import FeatureReplenishment, StaticFeatur
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.rendering.config import RenderConfig
 from bmask_slam.rendering.sequence import render_sequence
+from bmask_slam.run_folder.reader import Run
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
@@ -72,7 +72,7 @@ class Outcome:
     Attributes:
         ate_mm: root mean square over all frames.
         tracked_share: of the frames.
-        left_out: share of keypoints left out, by what they are on; None where it is not there.
+        excluded: share of keypoints left out, by what they are on; None where it is not there.
         check_ms: median time of the moving-object filter in a frame, and its 95 % quantile.
         mostly_moving: frames in which nearly all keypoints seemed to move.
         covered: share of each picture that moves.
@@ -158,12 +158,11 @@ def measure(folder: Path, scene: str, variant: str, arguments: argparse.Namespac
     out = arguments.out / f"{folder.name}-{variant}"
     summary = run(RunOptions(folder, config, out=out, overwrite=True, quiet=True), make)
     metrics = {row["name"]: row["value"] for row in summary.rows}
-    if systems[0].pictures:
-        cv2.imwrite(str(out.with_suffix(".png")), strip(systems[0].pictures[:PICTURES]))
-    with (out / "frames.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    check_ms = np.percentile(systems[0].check_ms, [50, 95])
-    shares = {kind: systems[0].total(kind).share for kind in (*KINDS, "rest")}
+    system = systems[-1]  # a run that finds another camera begins anew
+    if system.pictures:
+        cv2.imwrite(str(out.with_suffix(".png")), strip(system.pictures[:PICTURES]))
+    check_ms = np.percentile(system.check_ms, [50, 95])
+    shares = {kind: system.total(kind).share for kind in (*KINDS, "rest")}
     return Outcome(
         scene=scene,
         variant=variant,
@@ -171,8 +170,8 @@ def measure(folder: Path, scene: str, variant: str, arguments: argparse.Namespac
         tracked_share=metrics["tracked_share"],
         excluded={k: None if np.isnan(share) else share for k, share in shares.items()},
         check_ms=(float(check_ms[0]), float(check_ms[1])),
-        mostly_moving=sum(int(row["mostly_moving"]) for row in rows),
-        covered=systems[0].covered,
+        mostly_moving=int(Run(out).frames.mostly_moving.sum()),
+        covered=system.covered,
     )
 
 

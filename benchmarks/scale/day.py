@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.graph.building import CAMERA, landmarks, visible, walk
 from benchmarks.graph.pose_graphs import position_rmse_m
-from benchmarks.suite.recorded_run import resident_mb
+from benchmarks.machine import resident_mb
 from bmask_slam.back_end.config import BackEndConfig
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.features.brisk import Features

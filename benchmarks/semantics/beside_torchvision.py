@@ -123,14 +123,14 @@ def difference(found: dict[str, Detected]) -> str:
 
 
 def peak_mb(name: str, owner: str) -> None:
-    """Peak memory of this process, in which one of them runs twice."""
+    """Peak memory of this process in MB (1e6 bytes), in which one of them runs twice."""
     import torch  # noqa: PLC0415
 
     detect = make(name)[owner]
     with torch.inference_mode():
         detect()
         detect()
-    print(f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f}")
+    print(f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6:.0f}")
 
 
 def main() -> None:

@@ -15,7 +15,6 @@ for an object, so that there are as many instances as the network gives at most.
 from __future__ import annotations
 
 import argparse
-import resource
 import subprocess
 import sys
 import time
@@ -27,6 +26,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.semantics.photographs import IMAGES, held_out
 from bmask_slam.graph.arrays import Array, Floats, Image
+from bmask_slam.runtime.memory import peak_rss_mb
 from bmask_slam.semantics.instances.coco_files import CocoImage
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.instances.instances import Instance
@@ -145,8 +145,7 @@ def one(name: str) -> None:
         run()
         times.append((time.perf_counter() - before[0], time.process_time() - before[1]))
     wall_ms, cpu_ms = 1000 * np.median(times[2:], axis=0)
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"{name:18} {wall_ms:12.0f} {cpu_ms:12.0f} {peak_mb:9.0f} MB")
+    print(f"{name:18} {wall_ms:12.0f} {cpu_ms:12.0f} {peak_rss_mb():9.0f} MB")
 
 
 def _light() -> Callable[[], object]:

@@ -2,7 +2,7 @@
 
 KITCHEN: measured for this project on two cores without a GPU, on the same 600 frames and with the
 same calibration, by the people who set the task; ORB-SLAM2 is ten runs, no loop closed.
-TRAJECTORIES: what is known of the trajectory files that the evaluation is checked with.
+PUBLISHED_ATE_CM: what is known of the trajectory files that the evaluation is checked with.
 """
 
 from __future__ import annotations
@@ -32,10 +32,4 @@ KITCHEN = (
 PUBLISHED_ATE_CM = {
     "freiburg1_xyz-rgbdslam.txt": "1.34 (Mur-Artal et al. 2015, Table III); file: 1.35",
     "fr2_desk_ORB.txt": "0.88 (ORB-SLAM, keyframes, Sim(3)); file: 0.81",
-}
-
-LIMITS = {
-    "redkitchen": "ATE 4.84 cm (ORB-SLAM2), aim 4 cm; 33 ms a frame; all frames tracked",
-    "office": "ATE 5 mm",
-    "corridor": "drift 1 % of the path",
 }

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import filecmp
 import json
 import logging
+import multiprocessing
 import subprocess
 import sys
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +21,8 @@ from bmask_slam.evaluation import Row, evaluate
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.trajectory import associate, read_tum
-from bmask_slam.run_folder.frame_file import STAGES
+from bmask_slam.run_folder.frame_file import STAGES, FrameTable
+from bmask_slam.run_folder.reader import Run
 
 logger = logging.getLogger(__name__)
 
@@ -91,6 +95,12 @@ def call(arguments: list[str]) -> str:
     return done.stdout
 
 
+def in_own_process(work: Callable[..., dict[str, float]], *given: Any) -> dict[str, float]:
+    """What a function returns in a new process; its error, or that it was killed, is raised."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(work, *given).result()
+
+
 def render(folder: Path, name: str, options: tuple[str, ...] = ()) -> str:
     """Render a sequence unless it exists; returns the command."""
     command = ["render", name, *options, "--out"]
@@ -116,9 +126,7 @@ def measure(job: Job, work: Path) -> Measurement:
 def read_run(out: Path, job: Job, command: str) -> Measurement:
     """The measurement of a run folder."""
     rows = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
-    with (out / "frames.csv").open(encoding="utf-8", newline="") as file:
-        frames = list(csv.DictReader(file))
-    status = [row["status"] for row in frames]
+    frames = Run(out).frames
     path_m, drift_m = drift(out / "trajectory.txt", job.folder / "groundtruth.txt")
     return Measurement(
         sequence=job.sequence,
@@ -128,22 +136,24 @@ def read_run(out: Path, job: Job, command: str) -> Measurement:
         printed=rows,
         stages={stage: stage_times(frames, stage) for stage in STAGES},
         frames=len(frames),
-        weak=status.count("WEAK"),
-        lost=status.count("LOST"),
+        weak=frames.status.count("WEAK"),
+        lost=frames.status.count("LOST"),
         path_m=path_m,
         drift_m=drift_m,
         folder=str(out),
     )
 
 
-def stage_times(frames: list[dict[str, str]], stage: str) -> tuple[float, float, int]:
+def stage_times(frames: FrameTable, stage: str) -> tuple[float, float, int]:
     """Median and 95th percentile in milliseconds, and how many frames took part.
 
     Stages of keyframes are counted over keyframes.
     """
-    taking = [row for row in frames if row["keyframe"] or stage not in KEYFRAME_STAGES]
-    times_ms = [float(row[f"{stage}_ms"]) for row in taking if row[f"{stage}_ms"]]
-    if not times_ms:
+    times_ms = frames.stage_ms[stage]
+    if stage in KEYFRAME_STAGES:
+        times_ms = times_ms[frames.keyframe_ids >= 0]
+    times_ms = times_ms[np.isfinite(times_ms)]
+    if not len(times_ms):
         return 0.0, 0.0, 0
     median, high = np.percentile(times_ms, (50, 95))
     return float(median), float(high), len(times_ms)

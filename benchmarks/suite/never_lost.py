@@ -13,7 +13,6 @@ and the time of features and tracking. An input without its recording is skipped
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -33,6 +32,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.rendering.config import RenderConfig
 from bmask_slam.rendering.sequence import render_sequence
+from bmask_slam.run_folder.reader import Run
 from bmask_slam.sequences.cameras import read_camera, write_camera
 from bmask_slam.system_config import SystemConfig
 
@@ -148,28 +148,27 @@ def outcome(entry: Input, sequence: Path, settings: list[str]) -> Outcome:
 
 
 def _read(out: Path, sequence: Path, hand_eye: bool) -> Outcome:
-    with (out / "frames.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    status = [row["status"] for row in rows]
-    runs = [len(list(group)) for lost, group in groupby(status, "LOST".__eq__) if lost]
-    times = [float(row["features_ms"]) + float(row["tracking_ms"]) for row in rows]
+    frames = Run(out).frames
+    status = frames.status
+    losses = [len(list(group)) for lost, group in groupby(status, "LOST".__eq__) if lost]
+    times_ms = frames.stage_ms["features"] + frames.stage_ms["tracking"]
     try:
         errors = evaluate(out, sequence, with_body=hand_eye)
         ate_m, rpe_m = errors.value("ate_rmse"), errors.value("rpe_trans_rmse_second")
     except (InputError, KeyError):
         ate_m = rpe_m = np.nan
     return Outcome(
-        tracked=_posed(out) / len(rows),
-        weak=status.count("WEAK") / len(rows),
-        longest_loss=max(runs, default=0),
+        tracked=_posed(out) / len(frames),
+        weak=status.count("WEAK") / len(frames),
+        longest_loss=max(losses, default=0),
         ate_mm=1e3 * ate_m,
         rpe_mm=1e3 * rpe_m,
-        tracking_ms=float(np.median(times)),
+        tracking_ms=float(np.nanmedian(times_ms)),
     )
 
 
 def _posed(out: Path) -> int:
-    """Poses of the main trajectory."""
+    """Poses of the main trajectory, which may have none."""
     lines = (out / "trajectory.txt").read_text(encoding="utf-8").splitlines()
     return sum(not line.startswith("#") for line in lines)
 

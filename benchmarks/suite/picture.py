@@ -23,9 +23,10 @@ from bmask_slam.evaluation.plot import draw_top_view
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.ply import read_ply
-from bmask_slam.graph.geometry import inverse, make_pose, transform
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.metrics import absolute_error
 from bmask_slam.graph.trajectory import Trajectory, associate, associate_stamps, read_tum
+from bmask_slam.rendering.engine.path import look_at
 from bmask_slam.semantics.instances.overlay import draw
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 from bmask_slam.sequences.frame import Frame
@@ -73,14 +74,6 @@ def depth_colours(depth_m: Array) -> Image:
     levels = np.rint(255 * (1 - 0.7 * share)).astype(np.uint8)
     coloured = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_PLASMA)[:, 0, ::-1]
     return np.ascontiguousarray(coloured)
-
-
-def look_at(eye_world: Array, target_world: Array) -> Array:
-    """Pose T_world_view of a camera at ``eye`` that looks at ``target``, with world z up."""
-    z = (target_world - eye_world) / np.linalg.norm(target_world - eye_world)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    return make_pose(np.stack([x, np.cross(z, x), z], axis=1), eye_world)
 
 
 def fitted_view(points: Array, azimuth_deg: float) -> tuple[Array, Camera]:

@@ -2,7 +2,8 @@
 
     python -m benchmarks.suite.recorded_run SEQUENCE --out RUN
 
-Nothing that is recorded changes the estimate: trajectory.txt is that of ``bmask-slam run``.
+Nothing that is recorded changes the estimate: trajectory.txt is that of ``bmask-slam run
+--segmenter none``.
 """
 
 from __future__ import annotations
@@ -12,9 +13,12 @@ import csv
 from pathlib import Path
 from typing import Any
 
+from benchmarks.machine import resident_mb
+from bmask_slam.config.configuration import resolve
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
 
 COLUMNS = ("frame", "keyframes", "landmarks", "graph_landmarks", "factors", "update_ms", "rss_mb")
@@ -48,14 +52,6 @@ class RecordingSystem(SlamSystem):
         return result
 
 
-def resident_mb() -> float:
-    """Resident memory of this process now in MB (1e6 bytes); NaN where there is no /proc."""
-    status = Path("/proc/self/statm")
-    if not status.exists():
-        return float("nan")
-    return int(status.read_text(encoding="ascii").split()[1]) * 4096 / 1e6
-
-
 def recorded(options: RunOptions) -> RecordingSystem:
     """The system of a run; the last one, if the run begins anew with the camera that it found."""
     systems: list[RecordingSystem] = []
@@ -74,7 +70,9 @@ def main() -> None:
     parser.add_argument("sequence", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
-    system = recorded(RunOptions(arguments.sequence, out=arguments.out, overwrite=True, quiet=True))
+    config = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
+    options = RunOptions(arguments.sequence, config, out=arguments.out, overwrite=True, quiet=True)
+    system = recorded(options)
     with (arguments.out / "growth.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
