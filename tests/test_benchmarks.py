@@ -300,6 +300,14 @@ def test_memory_is_told_in_the_same_megabytes_everywhere() -> None:
     assert resident_mb() - before_all_mb == pytest.approx(held.nbytes / 1e6, rel=0.02)
 
 
+def test_the_memory_of_a_network_is_not_that_of_the_process_that_started_its_own(capfd) -> None:
+    held = np.ones(100_000_000)  # getrusage of a process on Linux would have it too
+    code = "from benchmarks.semantics import beside_torchvision as b\n"
+    code += "b.make = lambda name: {'ours': dict}\nb.peak_mb('resnet50', 'ours')"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+    assert 0 < float(capfd.readouterr().out) < held.nbytes / 1e6
+
+
 def _mortal(what: str) -> dict[str, float]:
     if what == "killed":
         os.kill(os.getpid(), signal.SIGKILL)

@@ -13,7 +13,6 @@ scores and masks.
 from __future__ import annotations
 
 import argparse
-import resource
 import subprocess
 import sys
 import time
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.paths import ROOT
+from bmask_slam.runtime.memory import peak_rss_mb
 
 MODULE = "benchmarks.semantics.beside_torchvision"
 PACKAGES = ("torch==2.15.0", "torchvision==0.29.2", "numpy")
@@ -130,7 +130,7 @@ def peak_mb(name: str, owner: str) -> None:
     with torch.inference_mode():
         detect()
         detect()
-    print(f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6:.0f}")
+    print(f"{peak_rss_mb():.0f}")
 
 
 def main() -> None:
