@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError, did_you_mean
-from bmask_slam.rendering.sensors import check_sensors
+from bmask_slam.graph.sensors.streams import FILES
 
 SCENES: dict[str, str] = {
     "office": "an office for three with desks, computers and bookcases; one round through it",
@@ -20,6 +20,8 @@ SCENES: dict[str, str] = {
 """Names and one-line descriptions of the scenes."""
 CLOSED = ("corridor",)
 """Scenes whose path ends where it began: it can be walked more than once."""
+MARKERS = "markers"
+"""The sensor that is no file, but on the walls."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,8 @@ def check_config(config: RenderConfig) -> None:
             f"rolling shutter {config.rolling_shutter_ms} ms: must be at most the time between "
             f"images, {1000 / config.fps:.3g} ms, either way"
         )
-    check_sensors(config.sensors)
+    for sensor in set(config.sensors) - {*FILES, MARKERS}:
+        known = ", ".join((*FILES, MARKERS))
+        raise InputError(f"sensor {sensor!r} is unknown; choose of {known}")
     if min(config.width, config.height) < 16:
         raise InputError(f"{config.width}x{config.height}: too small; use at least 16x16")

@@ -42,8 +42,10 @@ def add_markers(b: SceneBuilder, path: CameraPath) -> list[PlacedMarker]:
     scene = _scene(b.parts)
     placed: list[PlacedMarker] = []
     for T in steady_poses(path, np.arange(0.0, duration_s(path), _EVERY_S)):
+        if len(placed) == _MOST:
+            break
         spot = _best_spot(scene, T, [m.T_world_marker[:3, 3] for m in placed])
-        if spot is not None and len(placed) < _MOST:
+        if spot is not None:
             placed.append(PlacedMarker(len(placed), _rolled(*spot, len(placed))))
     config = MarkersConfig()
     for marker in placed:

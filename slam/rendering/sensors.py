@@ -6,12 +6,10 @@ The noise has the sigmas of the default `SensorsConfig`, so that an estimate can
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import (
     inverse,
     make_pose,
@@ -27,6 +25,7 @@ from bmask_slam.graph.sensors.mounting import T_of
 from bmask_slam.graph.sensors.odometry import OdometryConfig, step_covariances
 from bmask_slam.graph.sensors.position import PositionConfig
 from bmask_slam.graph.sensors.streams import COLUMNS, FILES
+from bmask_slam.rendering.config import MARKERS, RenderConfig
 from bmask_slam.rendering.engine.path import CameraPath, camera_poses
 
 GRAVITY_M_S2 = 9.81
@@ -34,8 +33,6 @@ FORCE_HZ, FORCE_SIGMA_M_S2, FORCE_BIAS_M_S2 = 200.0, 0.05, 0.03
 """Of the accelerometer: rate, white noise of a sample, constant error of each axis."""
 POSITION_S, POSITION_SIGMA_M = 1.0, 0.1
 """Time between positions, and their error: those of ultra-wideband."""
-MARKERS = "markers"
-"""The sensor that is no file, but on the walls."""
 T_ENU_RENDERED = make_pose(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([40.0, -25.0, 8.0]))
 """The frame of positions: not that of the ground truth, with the same way up."""
 
@@ -107,20 +104,7 @@ def imu(T_world_camera: Array, hertz: float, config: ImuConfig, rng: np.random.G
     return np.column_stack(columns)
 
 
-class SensorsOf(Protocol):
-    """What is to be rendered, as `RenderConfig` says it."""
-
-    @property
-    def sensors(self) -> tuple[str, ...]: ...
-    @property
-    def fps(self) -> float: ...
-    @property
-    def seed(self) -> int: ...
-    @property
-    def sweeping(self) -> bool: ...
-
-
-def write_sensors(folder: Path, wanted: SensorsOf, poses: Array, path: CameraPath) -> None:
+def write_sensors(folder: Path, wanted: RenderConfig, poses: Array, path: CameraPath) -> None:
     """Write the files of sensors for the poses (N, 4, 4) of a path's frames."""
     config, stamps_s = SensorsConfig(), np.arange(len(poses)) / wanted.fps
     for number, name in enumerate(name for name in wanted.sensors if name != MARKERS):
@@ -149,11 +133,3 @@ def _text(name: str, rows: Array) -> str:
         lines = [f"# {name}, rendered", f"# {' '.join(COLUMNS[name])}"]
         lines += [f"{row[0]:.6f} " + " ".join(f"{x:.9f}" for x in row[1:]) for row in rows.tolist()]
     return "\n".join(lines) + "\n"
-
-
-def check_sensors(names: tuple[str, ...]) -> None:
-    """Raise InputError for a sensor that is not known."""
-    for name in names:
-        if name not in (*FILES, MARKERS):
-            known = ", ".join((*FILES, MARKERS))
-            raise InputError(f"sensor {name!r} is unknown; choose of {known}")

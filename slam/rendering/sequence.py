@@ -26,7 +26,13 @@ from bmask_slam.rendering.annotations import (
     true_boxes,
     visible_instances,
 )
-from bmask_slam.rendering.config import CLOSED, RenderConfig, check_config, kinect_camera
+from bmask_slam.rendering.config import (
+    CLOSED,
+    MARKERS,
+    RenderConfig,
+    check_config,
+    kinect_camera,
+)
 from bmask_slam.rendering.engine.builder import SceneBuilder
 from bmask_slam.rendering.engine.lighting import Lighting
 from bmask_slam.rendering.engine.path import CameraPath, camera_poses, poses_at
@@ -35,7 +41,7 @@ from bmask_slam.rendering.engine.scene import Scene, build_scene
 from bmask_slam.rendering.engine.sensor import blur, exposure_gain, measure_depth, optical_flow
 from bmask_slam.rendering.markers import PlacedMarker, add_markers, write_truth
 from bmask_slam.rendering.rooms.random_room import draw_room
-from bmask_slam.rendering.sensors import MARKERS, write_sensors
+from bmask_slam.rendering.sensors import write_sensors
 from bmask_slam.rendering.things.people import Cast, Role, add_people
 from bmask_slam.rendering.writer import new_folder, stored_depth, write_json, write_lists, write_png
 from bmask_slam.sequences.cameras import write_camera

@@ -165,12 +165,8 @@ def _bookcase(b: SceneBuilder, width: float) -> None:
 
 
 def _sideboard(b: SceneBuilder, width: float) -> None:
-    colour = _wood(b)
-    _cabinet(b, width, 0.42, b.rng.uniform(0.6, 0.85), colour)
-
-
-def _cabinet(b: SceneBuilder, width: float, depth: float, height: float, colour: Colour) -> None:
     """A low cupboard with two doors, its back at y = -0.02, and things on it."""
+    colour, depth, height = _wood(b), 0.42, b.rng.uniform(0.6, 0.85)
     y = -0.02 - depth / 2
     b.box((width, depth, height), wood(colour), (0, y, 0))
     for side in (-1, 1):

@@ -6,7 +6,7 @@ The person's frame has its origin on the floor, z up, and looks along -y; the ri
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -86,8 +86,7 @@ def holding(posture: Posture, how: str) -> Posture:
     front = 0.25, 1.35
     arm = {"hang": (0.02, 0.05), "front": front, "both": front, "high": (0.75, 1.3)}[how]
     other = front if how == "both" else (posture.shoulders[1], posture.elbows[1])
-    changes = {"shoulders": (arm[0], other[0]), "elbows": (arm[1], other[1])}
-    return Posture(**{**posture.__dict__, **changes})
+    return replace(posture, shoulders=(arm[0], other[0]), elbows=(arm[1], other[1]))
 
 
 def bones(posture: Posture) -> dict[str, Array]:

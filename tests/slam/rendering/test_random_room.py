@@ -133,7 +133,7 @@ def test_every_class_occurs(rooms: list[RandomRoom]) -> None:
     assert set(found) <= set(CLASSES)
     assert min(n for name, n in counts.items() if name != "person") >= 10, counts
     builder = _Bare(0)
-    add_people(builder, rooms[0].roles, rooms[0].lighting, 1)
+    add_people(builder, rooms[0].roles, rooms[0].lighting, rooms[0].path)
     assert "person" in builder.categories
 
 
