@@ -15,6 +15,7 @@ import random
 import re
 import resource
 import select
+import shutil
 import signal
 import sys
 import time
@@ -185,7 +186,7 @@ def fuzz(reader: Reader, folder: Path, limit: int, seconds: float, seed: int = 0
         died = _collect(count, ends[0], child)
         if died:
             count.inputs += 1
-            _fault(count, died, path.read_bytes() if path.is_file() else b"", folder)
+            _fault(count, died, died, path.read_bytes() if path.is_file() else b"")
         if not died:
             break
         skip = count.inputs
@@ -250,8 +251,6 @@ def _tried(reader: Reader, path: Path, data: bytes) -> dict[str, Any]:
 
 
 def _remove(path: Path) -> None:
-    import shutil
-
     shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
@@ -282,7 +281,7 @@ def _collect(count: Count, source: int, child: int) -> str:
             count.slowest_ms = max(count.slowest_ms, line["ms"])
             count.peak_mb = max(count.peak_mb, line["peak"] / 1e6)
             if line["fault"]:
-                _fault(count, line, bytes.fromhex(line["data"]), None)
+                _fault(count, line["place"], line["fault"], bytes.fromhex(line["data"]))
             else:
                 setattr(count, line["result"], getattr(count, line["result"]) + 1)
     with suppress(ProcessLookupError):
@@ -301,8 +300,7 @@ def _ended(child: int, seconds: float) -> bool:
     return False
 
 
-def _fault(count: Count, what: Any, data: bytes, folder: Path | None) -> None:
-    place, text = (what, what) if isinstance(what, str) else (what["place"], what["fault"])
+def _fault(count: Count, place: str, text: str, data: bytes) -> None:
     count.faulty += 1
     if place not in count.faults and len(count.faults) < REPORTED:
         count.faults[place] = text
@@ -329,7 +327,7 @@ def table(counts: Sequence[Count]) -> str:
         (c.reader, c.inputs, c.accepted, c.refused, c.faulty, f"{c.slowest_ms:.0f}",
          f"{c.peak_mb:.0f}") for c in counts
     ]  # fmt: skip
-    sums = [sum(c.__getattribute__(name) for c in counts) for name in SUMMED]
+    sums = [sum(getattr(c, name) for c in counts) for name in SUMMED]
     slowest = max((c.slowest_ms for c in counts), default=0.0)
     peak = max((c.peak_mb for c in counts), default=0.0)
     rows.append(("all", *sums, f"{slowest:.0f}", f"{peak:.0f}"))
