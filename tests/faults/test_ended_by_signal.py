@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from faults import frames_written
 
 from bmask_slam.graph.trajectory import read_tum
 
@@ -21,11 +22,6 @@ USUAL = (
     "os.execvp(sys.argv[1], sys.argv[1:])"
 )
 """Starts a command that SIGHUP ends, also where these tests themselves run under nohup."""
-
-
-def frames_written(out: Path) -> int:
-    path = out / "frames.csv"
-    return len(path.read_text().splitlines()) - 1 if path.is_file() else 0
 
 
 @pytest.mark.parametrize("words", [("run",), ("live", "--realtime")])

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import random
 import subprocess
@@ -15,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from faults import untimed_files
 from repository import KITCHEN
 
 from bmask_slam.offline.runner import RunOptions, resume, run
@@ -22,7 +22,6 @@ from bmask_slam.run_folder.folder import CHECKPOINT
 
 FRAMES, EVERY = 16, 4
 SEEDS = range(int(os.environ.get("BMASK_SLAM_FAULT_SEEDS", "1")))
-TIMED = ("log.txt", "metrics.json", "trajectory.png")  # hold dates or times
 OPTIONS = RunOptions(KITCHEN, max_frames=FRAMES, checkpoint_every=EVERY, quiet=True)
 pytestmark = pytest.mark.skipif(not KITCHEN.is_dir(), reason="no ../shared/data/redkitchen here")
 
@@ -45,15 +44,6 @@ def kill_after_lines(words: list[str], frames: Path, lines: int, delay_s: float)
     return was_running
 
 
-def contents(folder: Path) -> dict[str, object]:
-    """All files of a run, without times."""
-    files = {path.name: path.read_bytes() for path in folder.iterdir()}
-    with (folder / "frames.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    untimed = [{k: v for k, v in row.items() if not k.endswith("_ms")} for row in rows]
-    return {**files, **dict.fromkeys(TIMED), "frames.csv": untimed}
-
-
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_real_program_on_real_frames(undisturbed: Path, tmp_path: Path, seed: int) -> None:
     draw, out = random.Random(seed), tmp_path / "out"
@@ -66,4 +56,4 @@ def test_the_real_program_on_real_frames(undisturbed: Path, tmp_path: Path, seed
         assert (out / CHECKPOINT).exists(), (seed, lines)
         command = ["run", "--resume", str(out)]
     resume(out, {"quiet": True})
-    assert contents(out) == contents(undisturbed), (seed, lines)
+    assert untimed_files(out) == untimed_files(undisturbed), (seed, lines)

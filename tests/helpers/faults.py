@@ -1,7 +1,8 @@
-"""Faults for tests: full disks, time that passes at once, and what is left of processes."""
+"""Faults for tests: full disks, time that passes at once, what is left of processes and runs."""
 
 from __future__ import annotations
 
+import csv
 import os
 import time
 from collections.abc import Callable
@@ -10,6 +11,8 @@ from pathlib import Path
 
 from bmask_slam.runtime.fork_server import server_pid
 
+TIMED = ("log.txt", "metrics.json", "trajectory.png")
+"""Files of a run that hold dates or times."""
 LONG_S = 1200.0
 """Longest time that a test waits for what must happen. A process of low priority needs it beside
 six busy programs, which leave it a hundredth of a core."""
@@ -58,6 +61,21 @@ def children() -> set[int]:
                 found |= pids
                 waiting += pids
     return set(running(sorted(found - {server})))
+
+
+def frames_written(out: Path) -> int:
+    """Lines of a run's frames.csv, without the head."""
+    path = out / "frames.csv"
+    return len(path.read_text().splitlines()) - 1 if path.is_file() else 0
+
+
+def untimed_files(folder: Path) -> dict[str, object]:
+    """All files of a run, without times."""
+    files = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with (folder / "frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    untimed = [{k: v for k, v in row.items() if not k.endswith("_ms")} for row in rows]
+    return {**files, **dict.fromkeys(TIMED), "frames.csv": untimed}
 
 
 def running(pids: list[int]) -> list[int]:

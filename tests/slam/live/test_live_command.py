@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faults import frames_written
 from scipy.spatial import cKDTree
 
 from bmask_slam.cli import main
@@ -36,11 +37,6 @@ def start(recording: Path, out: Path, *options: str) -> subprocess.Popen[str]:
         *options,
     ]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def frames_written(out: Path) -> int:
-    path = out / "frames.csv"
-    return len(path.read_text().splitlines()) - 1 if path.is_file() else 0
 
 
 def test_masks_from_another_process_label_the_map(slow_office, tmp_path, capsys) -> None:

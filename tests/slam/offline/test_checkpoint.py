@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import shutil
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_run import FakeSystem, make_sequence, signal_at
+from faults import untimed_files
 
 from bmask_slam.cli import main
 from bmask_slam.config.configuration import resolve
@@ -27,7 +27,6 @@ from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.tracker import TrackingConfig
 
 EVERY = 6
-TIMED = ("log.txt", "metrics.json", "trajectory.png")  # hold dates or times
 
 
 @pytest.fixture
@@ -42,15 +41,6 @@ def quick_plots(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def options(sequence: Path, out: Path, **more: object) -> RunOptions:
     return RunOptions(sequence, out=out, quiet=True, checkpoint_every=EVERY, **more)
-
-
-def result(folder: Path) -> dict[str, object]:
-    """All files of a run, without times."""
-    files = {path.name: path.read_bytes() for path in folder.iterdir()}
-    with (folder / "frames.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    untimed = [{k: v for k, v in row.items() if not k.endswith("_ms")} for row in rows]
-    return {**files, **dict.fromkeys(TIMED), "frames.csv": untimed}
 
 
 def killed(work: Callable[[], object]) -> bool:
@@ -84,7 +74,7 @@ def test_killed_at_every_rename_and_resumed(
 ) -> None:
     """Files change their contents at renames only, but for frames.csv and log.txt, which grow."""
     run(options(sequence, tmp_path / "undisturbed"), FakeSystem)
-    expected, kills, before_any = result(tmp_path / "undisturbed"), 0, 0
+    expected, kills, before_any = untimed_files(tmp_path / "undisturbed"), 0, 0
     for number in range(1, 100):
         for after in (False, True):
             out = tmp_path / f"{number}-{after}"
@@ -101,7 +91,7 @@ def test_killed_at_every_rename_and_resumed(
                     resume(out, make_system=FakeSystem)
                 continue
             assert resume(out, make_system=FakeSystem) is not None
-            assert result(out) == expected
+            assert untimed_files(out) == expected
 
 
 @pytest.mark.parametrize("frame", [0, 5, 6, 7, 19])
@@ -115,7 +105,7 @@ def test_killed_in_a_frame_twice_and_resumed(sequence: Path, tmp_path: Path, fra
     if was_killed:
         assert killed(lambda: resume(out, make_system=deadly))
         assert resume(out, make_system=FakeSystem) is not None
-    assert result(out) == result(tmp_path / "undisturbed")
+    assert untimed_files(out) == untimed_files(tmp_path / "undisturbed")
 
 
 def test_counts_and_broken_frames_are_carried_over(sequence: Path, tmp_path: Path, capsys) -> None:
@@ -165,7 +155,7 @@ def test_a_stopped_run_is_complete_and_can_be_resumed(sequence: Path, tmp_path: 
     summary = resume(tmp_path / "out", make_system=FakeSystem)
     assert (summary.stopped_by, summary.frames, summary.resumable) == (None, 20, False)
     run(options(sequence, tmp_path / "whole"), FakeSystem)
-    assert result(tmp_path / "out") == result(tmp_path / "whole")
+    assert untimed_files(tmp_path / "out") == untimed_files(tmp_path / "whole")
 
 
 @pytest.fixture
