@@ -39,7 +39,8 @@ import numpy as np
 
 from benchmarks.machine import describe_commit, now
 from benchmarks.pages import WRITTEN
-from benchmarks.paths import ROOT, SHARED
+from benchmarks.paths import ROOT
+from benchmarks.semantics.nyuv2 import NYUV2
 from benchmarks.semantics.photographs import IMAGES, held_out
 from bmask_slam.graph.arrays import Array, Image, Ints
 from bmask_slam.graph.files.data_files import data_path
@@ -53,7 +54,6 @@ from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 
-NYU = SHARED / "nyuv2"
 EVERY = 3
 SAME = {
     3: "bed", 4: "chair", 5: "couch", 6: "dining table", 13: "dining table", 22: "book",
@@ -225,13 +225,13 @@ def photographs(segmenter: Segmenter) -> Iterator[Photograph]:
     table = np.full(256, NOTHING)
     table[list(UNSURE)] = DOUBTFUL
     table[list(SAME)] = [segmenter.labels.number(name) for name in SAME.values()]
-    lines = (NYU / "split.txt").read_text(encoding="utf-8").split("\n")
+    lines = (NYUV2 / "split.txt").read_text(encoding="utf-8").split("\n")
     for line in [line for line in lines if line.strip()][::EVERY]:
         name = line.split()[0]
-        codes = cv2.imread(str(NYU / "labels" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+        codes = cv2.imread(str(NYUV2 / "labels" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
         assert codes is not None
         true = table[codes]
-        yield Photograph(1, read_colour(NYU / "images" / f"{name}.jpg"), true, _regions(true))
+        yield Photograph(1, read_colour(NYUV2 / "images" / f"{name}.jpg"), true, _regions(true))
 
 
 def _regions(true: Ints) -> Ints:
