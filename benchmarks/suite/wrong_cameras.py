@@ -97,6 +97,20 @@ def _nearest(
     return image
 
 
+def _turned(folder: Path, camera: Camera) -> Camera:
+    """Images turned by 180 degrees after they were taken: the last row was exposed first."""
+    for name in ("rgb", "depth"):
+        files = sorted((folder / name).resolve().iterdir())
+        (folder / name).unlink()
+        (folder / name).mkdir()
+        for path in files:
+            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            cv2.imwrite(str(folder / name / path.name), cv2.rotate(image, cv2.ROTATE_180))
+    k1, k2, p1, p2, k3 = camera.distortion
+    cx, cy = camera.width - 1 - camera.cx, camera.height - 1 - camera.cy
+    return replace(camera, cx=cx, cy=cy, distortion=(k1, k2, -p1, -p2, k3))
+
+
 FAULTS: dict[str, Fault] = {
     "none": lambda folder, camera: camera,
     "focal length +3 %": _focal(0.03),
@@ -111,6 +125,7 @@ FAULTS: dict[str, Fault] = {
     "depth stamps +90 ms": _stamps(0.09),
     "depth stamps -90 ms": _stamps(-0.09),
     "depth scale +2 %": _depth_scale(0.02),
+    "images turned by 180 degrees": _turned,
 }
 
 
