@@ -36,6 +36,7 @@ from bmask_slam.sequences.cameras import read_camera, write_camera
 
 NAMES = ("tum_fr1_rpy", "bonn_crowd", "redkitchen", "office")
 MAX_FRAMES = 300
+KINECT_READOUT_S = 0.026
 Fault = Callable[[Path, Camera], Camera]
 """Changes the images or lists of a copied folder, and returns the camera to write into it."""
 
@@ -98,7 +99,10 @@ def _nearest(
 
 
 def _turned(folder: Path, camera: Camera) -> Camera:
-    """Images turned by 180 degrees after they were taken: the last row was exposed first."""
+    """Images turned by 180 degrees after they were taken: the last row was exposed first.
+
+    The camera's readout time is known, and says the opposite.
+    """
     for name in ("rgb", "depth"):
         files = sorted((folder / name).resolve().iterdir())
         (folder / name).unlink()
@@ -108,7 +112,8 @@ def _turned(folder: Path, camera: Camera) -> Camera:
             cv2.imwrite(str(folder / name / path.name), cv2.rotate(image, cv2.ROTATE_180))
     k1, k2, p1, p2, k3 = camera.distortion
     cx, cy = camera.width - 1 - camera.cx, camera.height - 1 - camera.cy
-    return replace(camera, cx=cx, cy=cy, distortion=(k1, k2, -p1, -p2, k3))
+    camera = replace(camera, cx=cx, cy=cy, distortion=(k1, k2, -p1, -p2, k3))
+    return replace(camera, rolling_shutter_s=KINECT_READOUT_S)
 
 
 FAULTS: dict[str, Fault] = {
