@@ -81,7 +81,9 @@ def finish_run(run: ActiveRun) -> RunSummary:
         resumable,
         text,
         run.sequence.recording.warnings
-        + weakly_tracked(folder / FRAMES, options.config.tracking.min_inliers)
+        + weakly_tracked(
+            folder / FRAMES, options.config.tracking.min_inliers, bool(options.localise)
+        )
         + checked.warnings
         + _unwritten_checkpoints(run),
     )

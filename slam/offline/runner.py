@@ -9,7 +9,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -28,6 +28,7 @@ from bmask_slam.labelling.upright_images import upright_of
 from bmask_slam.moving.covered_parts import covered_camera, with_verdict
 from bmask_slam.offline.checkpoint import Checkpoint, read_checkpoint
 from bmask_slam.offline.frame_loop import ActiveRun, process_frames, run_indices
+from bmask_slam.offline.inherited_camera import check_own_camera, inherited_calibration
 from bmask_slam.offline.map_localisation import MapLocalisation
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.offline.run_end import RunSummary, finish_run
@@ -171,25 +172,6 @@ def _reopened(options: RunOptions, checkpoint: Checkpoint) -> Sequence:
     return sequence if own != found.given else sequence.with_camera(found.camera)
 
 
-def inherited_calibration(options: RunOptions, sequence: Sequence) -> SelfCalibration:
-    """The camera to begin with: the sequence's own, or what the run of the map has found of it."""
-    given, source = sequence.camera, options.map or options.localise
-    if options.calibrate == "off" or source is None:
-        return SelfCalibration(given, given)
-    return _calibration_of_map(options, source, given)
-
-
-def _calibration_of_map(options: RunOptions, source: Path, given: Camera) -> SelfCalibration:
-    """The camera that the run of a map has found, if only what runs adopt differs in it."""
-    camera = read_map(source)[1]
-    found = ("rolling_shutter_s", "depth_time_offset_s", "depth_distortion")
-    times = {name: getattr(camera, name) for name in found}
-    camera = replace(camera, covered=given.covered)
-    if options.camera is not None or replace(given, **times) != camera or camera == given:
-        return SelfCalibration(given, given)
-    return SelfCalibration(given, camera, f"camera as found by {source}")
-
-
 def find_reference(path: Path | None, sequence: Sequence) -> Trajectory | None:
     """The reference trajectory: of a file, of a sequence folder, or of the sequence itself.
 
@@ -269,13 +251,6 @@ def with_sensors(system: System, sequence: Sequence) -> System:
     return system
 
 
-def _differing(made: Camera, now: Camera) -> str:
-    """In what two cameras differ that decides where points are: "fx 525.0 and 517.3"."""
-    pairs = ((f.name, getattr(made, f.name), getattr(now, f.name)) for f in fields(Camera))
-    others = "depth_noise", "up", "covered"
-    return ", ".join(f"{n} {a} and {b}" for n, a, b in pairs if n not in others and a != b)
-
-
 def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSystem) -> System:
     """The system of a new run: empty, or with the map of ``options.map`` or ``localise``.
 
@@ -286,12 +261,8 @@ def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSyste
     if source is None:
         return make_system(sequence.camera, options.config)
     state, camera = read_map(source)
-    if options.map and (differing := _differing(camera, sequence.camera)):
-        size = "give --full-size; " if camera.reduced_by < sequence.camera.reduced_by else ""
-        raise InputError(
-            f"{source}: made with another camera than that of {sequence.folder} ({differing}); "
-            f"{size}a map can only be continued with its own camera (--localise accepts any)"
-        )
+    if options.map:
+        check_own_camera(source, camera, sequence)
     make = MapLocalisation if options.localise else make_system
     system = make(sequence.camera, options.config)
     system.restore(state, source)

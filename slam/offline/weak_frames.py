@@ -21,6 +21,10 @@ NEVER = (
     "tracking: no frame has a pose; a map begins where enough corners have depth: bmask-slam info "
     "says how many pixels have it, at what distance"
 )
+NEVER_IN_MAP = (
+    "tracking: no frame was recognised in the map; give the map of this place, seen from about "
+    "there, and the camera that the recording was made with"
+)
 CURES = {
     CONTRADICTED: (
         "either colour and depth, or the camera and its images, do not fit together (depth_scale, "
@@ -32,16 +36,18 @@ CURES = {
 }
 
 
-def weakly_tracked(path: Path, min_inliers: int) -> tuple[str, ...]:
+def weakly_tracked(path: Path, min_inliers: int, in_map: bool = False) -> tuple[str, ...]:
     """The warning that a run's frames.csv gives reason for, if any; it is logged too.
 
-    ``min_inliers`` is what an OK frame needs.
+    ``min_inliers`` is what an OK frame needs; ``in_map``: frames were only located in a map.
     """
     try:
-        text = weak_warning(read_frames(path), min_inliers)
+        frames = read_frames(path)
     except InputError as error:
         logger.info("frames not looked at: %s", error)
         return ()
+    nowhere = in_map and _never_tracked(frames)
+    text = NEVER_IN_MAP if nowhere else weak_warning(frames, min_inliers)
     if not text:
         return ()
     logger.warning(text)
@@ -50,7 +56,7 @@ def weakly_tracked(path: Path, min_inliers: int) -> tuple[str, ...]:
 
 def weak_warning(frames: FrameTable, min_inliers: int) -> str:
     """A line that says why the frames of a run are doubtful; "" where only a few are."""
-    if len(frames) >= MIN_FRAMES and set(frames.status) == {TrackingStatus.LOST.value}:
+    if _never_tracked(frames):
         return NEVER
     reasons = Counter(
         _reason(matches, inliers, min_inliers)
@@ -67,6 +73,10 @@ def weak_warning(frames: FrameTable, min_inliers: int) -> str:
         f"tracking: {weak} of {len(frames)} frames are WEAK, so the path is doubtful; in {count} "
         f"of them {reason}: {CURES[reason]}"
     )
+
+
+def _never_tracked(frames: FrameTable) -> bool:
+    return len(frames) >= MIN_FRAMES and set(frames.status) == {TrackingStatus.LOST.value}
 
 
 def _reason(matches: int, inliers: int, min_inliers: int) -> str:

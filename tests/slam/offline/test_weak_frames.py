@@ -36,6 +36,14 @@ def test_a_run_without_a_pose_says_what_it_needs(tmp_path: Path) -> None:
     assert "no frame has a pose; a map begins where enough corners have depth" in text
 
 
+def test_frames_that_are_not_in_the_map_are_said_to_be_so(tmp_path: Path) -> None:
+    rows = (f"{k},{k / 30:.6f},LOST,0,0,0,\n" for k in range(40))
+    (tmp_path / "frames.csv").write_text(HEAD + "".join(rows))
+    (text,) = weakly_tracked(tmp_path / "frames.csv", 30, in_map=True)
+    assert "no frame was recognised in the map; give the map of this place" in text
+    assert "depth" not in text
+
+
 def test_some_weak_frames_are_as_usual(tmp_path: Path) -> None:
     assert told(tmp_path, 9, 200, 90) == ""
     assert told(tmp_path, 0, 0, 0) == ""
