@@ -43,6 +43,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.labelling.mask_memory import MaskMemory, RememberingSegmenter
 from bmask_slam.offline import checkpoint, frame_loop, run_end, runner
+from bmask_slam.offline.inherited_camera import inherited_calibration
 from bmask_slam.offline.runner import RunOptions, RunSummary, resume, run
 from bmask_slam.offline.self_calibration import SelfCalibrator
 from bmask_slam.parallel.system import ParallelSystems
@@ -179,7 +180,7 @@ def test_the_map_of_such_a_run_is_continued_with_its_camera(
     gone_on = RunOptions(late_sweep, CONFIG, out=tmp_path / "on", map=found.folder, quiet=True)
     with pytest.raises(InputError, match="can only be continued with its own camera"):
         run(dataclasses.replace(gone_on, calibrate="off"))
-    later = runner.inherited_calibration(gone_on, runner.open_sequence(late_sweep))
+    later = inherited_calibration(gone_on, runner.open_sequence(late_sweep))
     assert later.camera == read_camera(found.folder / "camera.yaml")
 
 
