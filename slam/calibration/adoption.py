@@ -26,7 +26,8 @@ from bmask_slam.graph.camera import Camera, depth_distortion_terms
 logger = logging.getLogger(__name__)
 
 NAMES = {SHUTTER: "rolling shutter", TIME: "colour-depth delay"}
-OTHER_ORDER = "rows are read from the bottom up, as in images turned by 180 degrees"
+UPWARDS = "rows are read from the bottom up, as in images turned by 180 degrees"
+DOWNWARDS = "rows are read from the top down"
 UNOBSERVABLE = "readout, delay and bend of depth not observable in the motion"
 PLACES = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-0.75, 0.75, 7)), axis=-1)
 BEND_TERMS = depth_distortion_terms(PLACES).reshape(-1, len(BENDS))
@@ -72,7 +73,7 @@ class SelfCalibration:
 class Estimate:
     """Of one stretch: the vector (18,) before and after, standard deviations, and the problem.
 
-    ``in_other_order``: rows are read upwards, other than the camera's readout time says.
+    ``in_other_order``: rows are read in the order opposite to that of the camera's readout time.
     """
 
     before: Array
@@ -202,13 +203,14 @@ def with_other_order(state: SelfCalibration, mode: str) -> SelfCalibration:
     It becomes that of the camera given, so that all else is looked for anew. With a mode other than
     "auto" it is only told; what such an estimate says of other parameters means nothing.
     """
+    order = UPWARDS if state.given.rolling_shutter_s > 0 else DOWNWARDS
     if mode != "auto":
-        return replace(state, text=f"{OTHER_ORDER}: found, not applied", settled=True)
+        return replace(state, text=f"{order}: found, not applied", settled=True)
     return replace(
         state,
         given=in_other_order(state.given),
         camera=in_other_order(state.camera),
-        rows=f"{OTHER_ORDER}: found and applied",
+        rows=f"{order}: found and applied",
     )
 
 

@@ -74,6 +74,7 @@ class SupervisedWorker:
         self._target, self.arguments, self._policy = target, arguments, policy
         self._heard_s, self._used_s = time.monotonic(), 0.0
         self._is_ready, self.labels = False, tuple[str, ...]()
+        self._early: list[Any] = []  # that came with its first message
         self._worker = self._start()
 
     @property
@@ -95,10 +96,12 @@ class SupervisedWorker:
         deadline_s = time.monotonic() + self._policy.start_s
         while True:
             is_running = self._worker.is_running
-            for message in self._worker.receive(0.1):
+            messages = self._worker.receive(0.1)
+            for number, message in enumerate(messages, 1):
                 match message:
                     case Ready():
                         self._is_ready, self.labels = True, message.labels
+                        self._early += messages[number:]
                         return message
                     case Failure():
                         self.close()
@@ -118,7 +121,7 @@ class SupervisedWorker:
 
     def receive(self) -> list[Any]:
         """The messages received, without failures, which are logged, and ``Ready``."""
-        messages = self._worker.receive()
+        messages, self._early = [*self._early, *self._worker.receive()], []
         if messages:
             self._now_heard()
             self._is_ready = True

@@ -10,6 +10,7 @@ import pytest
 from faults import LONG_S, Clock, wait_until
 
 from bmask_slam.live.channel import Channel
+from bmask_slam.live.messages import Ready
 from bmask_slam.live.processes import supervision
 from bmask_slam.live.processes.supervision import RestartPolicy, SupervisedWorker
 from bmask_slam.live.processes.worker import Worker
@@ -56,6 +57,16 @@ def test_silence_counts_by_the_processor_time_that_was_used(
     assert not worker.restart_if_needed(busy=False)
     assert worker.restart_if_needed(busy=True) == hangs
     assert worker.crashes == hangs
+
+
+def test_what_comes_with_the_first_message_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the masks of an image that was sent while the network was loading."""
+    monkeypatch.setattr(supervision, "Worker", FakeWorker)
+    worker = SupervisedWorker("segmenter", "m:f", (), RestartPolicy())
+    batches = [["later"], [Ready(("chair",)), "masks", "more masks"], []]
+    monkeypatch.setattr(worker._worker, "receive", lambda *_: batches.pop())
+    assert worker.wait_until_ready().labels == ("chair",)
+    assert worker.receive() == ["masks", "more masks", "later"]
 
 
 def use_processor(channel: Channel) -> None:
