@@ -65,14 +65,19 @@ def _stamps(shift_s: float) -> Fault:
     return fault
 
 
+def _unlinked(folder: Path) -> list[Path]:
+    """The files of a folder that is a link; it becomes an empty folder."""
+    files = sorted(folder.resolve().iterdir())
+    folder.unlink()
+    folder.mkdir()
+    return files
+
+
 def _moved(baseline_m: float, scale: float, shift_px: tuple[float, float] = (0, 0)) -> Fault:
     """Depth as of a camera beside the colour camera, with ``scale`` times its focal lengths."""
 
     def fault(folder: Path, camera: Camera) -> Camera:
-        files = sorted((folder / "depth").resolve().iterdir())
-        (folder / "depth").unlink()
-        (folder / "depth").mkdir()
-        for path in files:
+        for path in _unlinked(folder / "depth"):
             stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
             v, u = np.nonzero(stored)
             beside_px = camera.fx * baseline_m * camera.depth_scale / stored[v, u]
@@ -104,10 +109,7 @@ def _turned(folder: Path, camera: Camera) -> Camera:
     The camera's readout time is known, and says the opposite.
     """
     for name in ("rgb", "depth"):
-        files = sorted((folder / name).resolve().iterdir())
-        (folder / name).unlink()
-        (folder / name).mkdir()
-        for path in files:
+        for path in _unlinked(folder / name):
             image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
             cv2.imwrite(str(folder / name / path.name), cv2.rotate(image, cv2.ROTATE_180))
     k1, k2, p1, p2, k3 = camera.distortion

@@ -160,9 +160,14 @@ def rows_in_front(
     """
     observations = tables.observations.select(rows)
     poses, points = tables.values_of(observations)
-    depth_m = np.einsum("ij,ij->i", points - poses[:, :3, 3], poses[:, :3, 2])
-    front = depth_m >= config.min_depth_m
+    front = depths_m(poses, points) >= config.min_depth_m
     return observations.select(front), poses[front], points[front]
+
+
+def depths_m(poses_world_camera: Array, points_world: Array) -> Array:
+    """Depths (M,) of points (M, 3) along the optical axes of cameras (M, 4, 4)."""
+    offsets = points_world - poses_world_camera[:, :3, 3]
+    return np.einsum("ij,ij->i", offsets, poses_world_camera[:, :3, 2])
 
 
 @dataclass(frozen=True)

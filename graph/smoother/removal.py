@@ -19,6 +19,7 @@ from bmask_slam.graph.factors.observability import constrained_landmarks, firm_c
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.smoother.anchoring import (
     anchor_loose,
+    depths_m,
     keyframes_anchored_by,
     loose_among,
     rows_in_front,
@@ -74,11 +75,7 @@ def with_behind_removed(
     when it next linearises them.
     """
     observations = tables.observations.select(tables.observations.used_rows())
-    poses = tables.keyframes.values
-    axes, origin_m = poses[:, :3, 2], np.sum(poses[:, :3, 3] * poses[:, :3, 2], axis=1)
-    row = np.searchsorted(tables.keyframes.ids, observations.keyframe_ids)
-    points = tables.landmarks.get(observations.landmark_ids)
-    depth_m = np.sum(points * axes[row], axis=1) - origin_m[row]
+    depth_m = depths_m(*tables.values_of(observations))
     behind = observations.pairs[depth_m < config.min_depth_m]
     if not len(behind):
         return update

@@ -56,7 +56,7 @@ RADII_PX = (24.0, 8.0)
 
 OTHER_ORDER_SIGMAS = 5.0
 """A readout time is surely of the other sign if it is so many standard deviations below 0."""
-SHUTTER_PRIOR_S = 0.03
+SHUTTER_PRIOR_S = 0.03  # reaches from a readout time to the same of the other sign
 
 ITERATIONS = 2  # for the row that decides when a landmark was exposed
 

@@ -9,11 +9,7 @@ from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING
 
-from bmask_slam.calibration.config import (
-    BENDS,
-    CALIBRATE,
-    SelfCalibrationConfig,
-)
+from bmask_slam.calibration.config import BENDS, CALIBRATE, SelfCalibrationConfig
 from bmask_slam.graph.calibration.model import SHUTTER, TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError

@@ -42,12 +42,12 @@ def weakly_tracked(path: Path, min_inliers: int, in_map: bool = False) -> tuple[
     ``min_inliers`` is what an OK frame needs; ``in_map``: frames were only located in a map.
     """
     try:
-        frames = read_frames(path)
+        text = weak_warning(read_frames(path), min_inliers)
     except InputError as error:
         logger.info("frames not looked at: %s", error)
         return ()
-    nowhere = in_map and _never_tracked(frames)
-    text = NEVER_IN_MAP if nowhere else weak_warning(frames, min_inliers)
+    if in_map and text == NEVER:
+        text = NEVER_IN_MAP
     if not text:
         return ()
     logger.warning(text)
@@ -56,7 +56,7 @@ def weakly_tracked(path: Path, min_inliers: int, in_map: bool = False) -> tuple[
 
 def weak_warning(frames: FrameTable, min_inliers: int) -> str:
     """A line that says why the frames of a run are doubtful; "" where only a few are."""
-    if _never_tracked(frames):
+    if len(frames) >= MIN_FRAMES and set(frames.status) == {TrackingStatus.LOST.value}:
         return NEVER
     reasons = Counter(
         _reason(matches, inliers, min_inliers)
@@ -73,10 +73,6 @@ def weak_warning(frames: FrameTable, min_inliers: int) -> str:
         f"tracking: {weak} of {len(frames)} frames are WEAK, so the path is doubtful; in {count} "
         f"of them {reason}: {CURES[reason]}"
     )
-
-
-def _never_tracked(frames: FrameTable) -> bool:
-    return len(frames) >= MIN_FRAMES and set(frames.status) == {TrackingStatus.LOST.value}
 
 
 def _reason(matches: int, inliers: int, min_inliers: int) -> str:

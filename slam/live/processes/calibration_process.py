@@ -157,14 +157,13 @@ class CalibrationServer:
 
         None if it is too little.
         """
+        worth_s = self._setup.config.min_change_s
         try:
-            for _ in range(2):
-                given = self._state.given
-                worth_s = self._setup.config.min_change_s
-                estimate = estimate_again(world, run, reader, given, worth_s)
-                if estimate is None or not estimate.in_other_order:
-                    break
+            estimate = estimate_again(world, run, reader, self._state.given, worth_s)
+            if estimate is not None and estimate.in_other_order:
                 self._state = with_other_order(self._state, self._setup.mode)
+                if self._state.rows:
+                    estimate = estimate_again(world, run, reader, self._state.given, worth_s)
         except InputError as error:
             logger.info("calibration: %s", error)
             return None

@@ -26,12 +26,7 @@ from bmask_slam.calibration.adoption import (
     surely_other,
 )
 from bmask_slam.calibration.camera_check import CameraCheck
-from bmask_slam.calibration.config import (
-    BENDS,
-    FREE,
-    SelfCalibrationConfig,
-    estimated_priors,
-)
+from bmask_slam.calibration.config import BENDS, FREE, SelfCalibrationConfig, estimated_priors
 from bmask_slam.calibration.report import parameters_named
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import plot
