@@ -31,6 +31,7 @@ from bmask_slam.run_folder.map_file import MAP, SavedRun, write_map
 from bmask_slam.run_folder.semantic_files import semantic_writers
 from bmask_slam.sensing.carried_frames import example_state
 from bmask_slam.system_config import SystemConfig
+from bmask_slam.world.keyframe import Keyframe
 
 OLDER_ARRAYS = ("semantics.labels.counts", "semantics.objects.labels.counts")
 """Arrays in older files that are read by nothing today."""
@@ -109,6 +110,11 @@ class SystemResults(ABC):
         poses = np.array([k.T_world_camera for k in chosen]).reshape(-1, 4, 4)
         return Trajectory(np.array([k.timestamp_s for k in chosen]), poses)
 
+    def session_keyframes(self) -> list[Keyframe]:
+        """The keyframes that this session made; a run may have continued a map."""
+        world = self.map.world
+        return [k for k in world.keyframes.values() if k.id >= self._first_keyframe]
+
     def keyframe_covariances(self) -> KeyframeCovariances:
         """Covariances of the keyframes of the largest segment that have a stamp."""
         chosen = self.map.world.in_segment(self.largest_segment())
@@ -151,7 +157,7 @@ class SystemResults(ABC):
     def as_run(self) -> SavedRun:
         """The run so far as one that was saved and read again, without its folder."""
         tables = self.mapper.smoother.tables
-        stamps_s = {k.id: k.timestamp_s for k in self.map.world.keyframes.values()}
+        stamps_s = {k.id: k.timestamp_s for k in self.session_keyframes()}
         return SavedRun(
             Path(),
             tables,

@@ -95,7 +95,8 @@ def _write_zip(file: IO[bytes], kind: FileKind, arrays: Arrays) -> None:
 def read_arrays(path: Path, kind: FileKind) -> tuple[Header, Arrays]:
     """Load what write_arrays saved. Raises InputError for a missing, foreign or broken file."""
     if not path.is_file():
-        raise InputError(f"{path}: there is no saved {kind.noun} here; give a run that has one")
+        cure = "give a finished run, not one with --localise"
+        raise InputError(f"{path}: there is no saved {kind.noun} here; {cure}")
     try:
         arrays = _read_zip(path)
         header: Header = _HEADERS.validate_json(str(arrays.pop(_HEADER)))

@@ -67,7 +67,7 @@ def read_rows(
             number, or a zero quaternion; or no file.
     """
     if not path.is_file():
-        raise InputError(f"{path}: no such file; give a graph in g2o format")
+        raise InputError(f"{path}: no such file; give a run folder, or a graph in g2o format")
     rows = {tag: Rows() for tag in tags}
     fixed: dict[int, int] = {}
     unknown: Counter[str] = Counter()

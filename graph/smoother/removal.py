@@ -76,11 +76,27 @@ def with_behind_removed(
     """
     observations = tables.observations.select(tables.observations.used_rows())
     depth_m = depths_m(*tables.values_of(observations))
-    behind = observations.pairs[depth_m < config.min_depth_m]
-    if not len(behind):
+    return _without(update, observations.pairs[depth_m < config.min_depth_m])
+
+
+def with_far_removed(
+    update: GraphUpdate, tables: FactorTables, config: SmootherConfig
+) -> GraphUpdate:
+    """The update, which removes landmarks that no view's depth or parallax constrains as well.
+
+    Of no depth, they were carried so far away that GTSAM would fail at their next linearisation.
+    """
+    observations = tables.observations.select(tables.observations.used_rows())
+    values = tables.values_of(observations)
+    constrained = constrained_landmarks(observations, *values, config.min_parallax_deg)
+    return _without(update, observations.pairs[~np.isin(observations.landmark_ids, constrained)])
+
+
+def _without(update: GraphUpdate, pairs: Ints) -> GraphUpdate:
+    """The update, which removes these observations as well."""
+    if not len(pairs):
         return update
-    pairs = np.concatenate([update.remove_observations, behind])
-    return replace(update, remove_observations=pairs)
+    return replace(update, remove_observations=np.concatenate([update.remove_observations, pairs]))
 
 
 def remove(update: GraphUpdate, tables: FactorTables, config: SmootherConfig) -> Removal:

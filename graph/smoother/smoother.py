@@ -37,7 +37,7 @@ from bmask_slam.graph.marginals.landmark_marginalisation import (
 from bmask_slam.graph.marginals.summaries import mark_retracted, mark_returned, with_returning
 from bmask_slam.graph.smoother.anchoring import anchor_components, release_anchors, with_first_prior
 from bmask_slam.graph.smoother.isam2 import Change, Solver, SolverError, apply_user_and_inertial
-from bmask_slam.graph.smoother.removal import Removal, remove, with_behind_removed
+from bmask_slam.graph.smoother.removal import Removal, remove, with_behind_removed, with_far_removed
 from bmask_slam.graph.smoother.repair import repair, solve_without_own
 from bmask_slam.graph.smoother.storage import (
     factor_tables_of,
@@ -102,8 +102,8 @@ class Smoother:
 
         With ``drop_outliers`` observations whose chi-square without the kernel is beyond the 95 %
         bound are then removed, and the graph is optimised again. Those of landmarks that came to
-        lie behind the camera always are. Marginalised landmarks come back with all their
-        observations, until they are marginalised again.
+        lie behind the camera always are, and landmarks so far away that nothing constrains them.
+        Marginalised ones come back with all observations, until they are marginalised again.
         ISAM2 is discarded and rebuilt from the result if another update comes. A failure is
         repaired as in an update; if that fails, the values stay and the costs are NaN.
         """
@@ -123,7 +123,7 @@ class Smoother:
                     break
             wrong = no_pairs() if last else wrong_observations(self._tables, self._camera)
             update = with_behind_removed(GraphUpdate(remove_observations=wrong), *model)
-            report.add_removal(remove(update, *model))
+            report.add_removal(remove(with_far_removed(update, *model), *model))
         before, after = costs[-1]
         estimate = report.estimate(self._tables, self._solver.elapsed_s)
         return dataclasses.replace(estimate, cost_before=before, cost_after=after)

@@ -6,7 +6,7 @@ another readout time or delay, keypoints and depths move by the camera's velocit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.sequences.sequence import Sequence
 from bmask_slam.world.frame_observations import FrameObservations, FrameView
 from bmask_slam.world.keyframe import Keyframe
-from bmask_slam.world.world_map import WorldMap
 
 DepthChange = Callable[[Keyframe], tuple[Ints, Array]]
 """Keypoints (N,) of a keyframe, and what to add to their inverse depths (N,) in 1/m."""
@@ -31,9 +30,11 @@ FrameChange = Callable[[float, Array], tuple[Ints, Array]]
 
 
 def keyframe_motions(
-    world: WorldMap, paths: Mapping[int, Trajectory], depth_change: DepthChange | None
+    keyframes: Collection[Keyframe],
+    paths: Mapping[int, Trajectory],
+    depth_change: DepthChange | None,
 ) -> dict[int, KeyframeMotion]:
-    """The motion of every keyframe, by id.
+    """The motion of keyframes, by id.
 
     ``paths`` has the trajectory of each segment; ``depth_change`` is None if the delay of depth is
     the old one.
@@ -43,7 +44,6 @@ def keyframe_motions(
         twist = _twist_of(k.timestamp_s, paths.get(k.segment))
         return KeyframeMotion(twist, *(depth_change(k) if depth_change else ()))
 
-    keyframes = list(world.keyframes.values())
     return dict(zip((k.id for k in keyframes), in_threads(motion, keyframes), strict=True))
 
 

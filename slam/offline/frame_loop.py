@@ -94,7 +94,7 @@ def _begin(run: ActiveRun, checkpoints: Checkpoints) -> None:
     write_found_camera(run)
     checkpoints.write(run.system, run.counters)
     run.folder.begin_anew()
-    if found.adopted and not run.options.map:
+    if found.adopted:
         remove(run.folder.path / DENSE)
     for text in found.texts if first else ():
         events.begin_frame(first[0], float(run.sequence.timestamps_s[first[0]]))

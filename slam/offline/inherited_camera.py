@@ -2,16 +2,33 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Container
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from bmask_slam.calibration.adoption import SelfCalibration
+from bmask_slam.back_end.reinterpretation import KeyframeMotion
+from bmask_slam.calibration.adoption import (
+    DOWNWARDS,
+    UPWARDS,
+    SelfCalibration,
+    in_other_order,
+)
+from bmask_slam.calibration.keyframe_motions import keyframe_motions
+from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import part
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.run_folder.map_file import read_map
+from bmask_slam.sequences.camera_presets import is_preset
 from bmask_slam.sequences.sequence import Sequence
+from bmask_slam.system import SlamSystem
+from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.map_state import world_of
+
+logger = logging.getLogger(__name__)
 
 FOUND = ("rolling_shutter_s", "depth_time_offset_s", "depth_distortion")
 """What runs find of their camera and adopt."""
@@ -29,12 +46,41 @@ def inherited_calibration(options: RunOptions, sequence: Sequence) -> SelfCalibr
     if options.calibrate == "off" or source is None:
         return SelfCalibration(given, given)
     made = read_map(source)[1]
-    said = {n for n in FOUND if options.camera and getattr(given, n) != DEFAULTS[n]}
-    found: dict[str, Any] = {n: getattr(made, n) for n in FOUND if n not in said}
-    camera = replace(given, **found)
+    named = None if is_preset(options.camera) else options.camera
+    said = {n for n in FOUND if named and getattr(given, n) != DEFAULTS[n]}
+    camera = with_found_of(made, given, said)
     if camera == given or set(_differing(made, camera)) - said:
         return SelfCalibration(given, given)
-    return SelfCalibration(given, camera, f"camera as found by {source}")
+    rows = ""
+    if given.rolling_shutter_s * camera.rolling_shutter_s < 0:
+        given, rows = in_other_order(given), UPWARDS if given.rolling_shutter_s > 0 else DOWNWARDS
+    return SelfCalibration(given, camera, f"camera as found by {source}", rows=rows)
+
+
+def with_found_of(made: Camera, camera: Camera, but: Container[str] = ()) -> Camera:
+    """A camera with what was found of another one, ``but`` some attributes."""
+    found: dict[str, Any] = {n: getattr(made, n) for n in FOUND if n not in but}
+    return replace(camera, **found)
+
+
+def use_own_camera(system: SlamSystem, state: Arrays, camera: Camera) -> None:
+    """Let a system with the map of a state go on with the camera that was found since.
+
+    Of the keyframes before, depth has no other delay then, as their images are not at hand.
+    """
+    if camera != system.camera:
+        logger.info("the map follows the camera of this run: %s", camera)
+        system.use_camera(camera, recorded_motions(state))
+
+
+def recorded_motions(state: Arrays) -> dict[int, KeyframeMotion]:
+    """The motion of the keyframes that the last run of a map has tracked, by id."""
+    world, history = world_of(part(state, "mapper.world")), FrameHistory()
+    history.restore(part(state, "mapper.history"))
+    paths = history.trajectories(world)
+    tracked = {stamp_s for path in paths.values() for stamp_s in path.timestamps_s.tolist()}
+    known = [k for k in world.keyframes.values() if k.timestamp_s in tracked]
+    return keyframe_motions(known, paths, None)
 
 
 def check_own_camera(source: Path, made: Camera, sequence: Sequence) -> None:

@@ -7,14 +7,17 @@ import signal
 from dataclasses import dataclass
 from pathlib import Path
 
+from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.calibration.camera_check import CameraCheck, check_camera, depth_warning
 from bmask_slam.evaluation import Row
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.whole_file import remove
 from bmask_slam.offline.frame_loop import ActiveRun, map_options, write_found_camera
+from bmask_slam.offline.inherited_camera import recorded_motions
 from bmask_slam.offline.weak_frames import weakly_tracked
 from bmask_slam.run_folder.folder import CHECKPOINT, DENSE
 from bmask_slam.run_folder.frame_file import FRAMES
+from bmask_slam.run_folder.map_file import read_map
 from bmask_slam.run_folder.metrics import measure, row, save
 from bmask_slam.run_folder.reader import STOPPED
 from bmask_slam.runtime.memory import give_back_memory
@@ -94,7 +97,12 @@ def _look_back(run: ActiveRun) -> None:
 
     If it finds another camera, a dense map that was made on the way is removed, to be made again.
     """
-    if run.calibrator.look_back(run.system, run.sequence):
+    source = run.options.map
+
+    def earlier() -> dict[int, KeyframeMotion]:
+        return recorded_motions(read_map(source)[0]) if source else {}
+
+    if run.calibrator.look_back(run.system, run.sequence, earlier):
         run.sequence = run.sequence.with_camera(run.calibrator.state.camera)
         write_found_camera(run)
         remove(run.folder.path / DENSE)

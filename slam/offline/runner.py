@@ -28,7 +28,12 @@ from bmask_slam.labelling.upright_images import upright_of
 from bmask_slam.moving.covered_parts import covered_camera, with_verdict
 from bmask_slam.offline.checkpoint import Checkpoint, read_checkpoint
 from bmask_slam.offline.frame_loop import ActiveRun, process_frames, run_indices
-from bmask_slam.offline.inherited_camera import check_own_camera, inherited_calibration
+from bmask_slam.offline.inherited_camera import (
+    check_own_camera,
+    inherited_calibration,
+    use_own_camera,
+    with_found_of,
+)
 from bmask_slam.offline.map_localisation import MapLocalisation
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.offline.run_end import RunSummary, finish_run
@@ -42,6 +47,7 @@ from bmask_slam.run_folder.reader import Run
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.semantics.segmenters.upright import Upright
+from bmask_slam.sequences.camera_presets import is_preset
 from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
@@ -69,8 +75,10 @@ def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummar
     sequence = open_sequence(options.sequence, camera=options.camera, full_size=options.full_size)
     reference = find_reference(options.reference, sequence)
     name = "-".join(filter(None, (sequence.name, options.config_name)))
+    out = options.out or free_run_path(name)
+    _refuse_inputs(out, options)
     with (
-        RunFolder(options.out or free_run_path(name), options.overwrite) as folder,
+        RunFolder(out, options.overwrite) as folder,
         StopRequest() as stop,
         ExitStack() as stack,
     ):
@@ -130,12 +138,22 @@ def resume(
         return _finished(active, make)
 
 
+def _refuse_inputs(out: Path, options: RunOptions) -> None:
+    """Refuse to overwrite the map or the camera that a run begins with. Raises InputError."""
+    camera = None if is_preset(options.camera) else options.camera
+    for given in filter(None, (options.map, options.localise, camera)):
+        if options.overwrite and out.resolve() in (given.resolve(), given.resolve().parent):
+            raise InputError(f"{given}: is an input, which stays as it is; choose another --out")
+
+
 def _finished(active: ActiveRun, make_system: MakeSystem) -> RunSummary:
     """A run after its last frame, begun anew as often as another camera was found for it."""
     while process_frames(active):
         options, camera = active.options, active.calibrator.state.camera
         active.sequence = open_sequence(options.sequence, camera=camera)
-        active.system = with_sensors(make_system(camera, options.config), active.sequence)
+        system = start_system(options, active.sequence, make_system)
+        active.system = with_sensors(system, active.sequence)
+        del system
         active.counters = RunCounters(wall_s=active.counters.wall_s)
         gc.collect()  # the system of before, whose parts know each other
         give_back_memory()
@@ -156,8 +174,8 @@ def _without_covered_parts(options: RunOptions, sequence: Sequence) -> tuple[Seq
 def _calibrator(
     options: RunOptions, state: SelfCalibration, masks: MaskMemory | None
 ) -> SelfCalibrator:
-    """What looks for readout, delay and bend of the camera; nothing in a run that uses a map."""
-    mode = "off" if options.map or options.localise else options.calibrate
+    """What looks for readout, delay and bend of the camera; nothing where no map is made."""
+    mode = "off" if options.localise else options.calibrate
     return SelfCalibrator(state, mode, masks)
 
 
@@ -260,12 +278,17 @@ def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSyste
     source = options.map or options.localise
     if source is None:
         return make_system(sequence.camera, options.config)
-    state, camera = read_map(source)
+    state, made = read_map(source)
+    camera = sequence.camera
     if options.map:
-        check_own_camera(source, camera, sequence)
+        own = made if options.calibrate == "off" else with_found_of(camera, made)
+        check_own_camera(source, own, sequence)
+        camera = with_found_of(made, camera)
     make = MapLocalisation if options.localise else make_system
-    system = make(sequence.camera, options.config)
+    system = make(camera, options.config)
     system.restore(state, source)
+    if options.map and isinstance(system, SlamSystem):
+        use_own_camera(system, state, sequence.camera)
     system.begin_session()
     logger.info("%s: %s keyframes", source, system.statistics()["keyframes"])
     return system

@@ -18,6 +18,7 @@ before the last optimisation; no frame is tracked again.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -52,6 +53,7 @@ from bmask_slam.world.keyframe import Keyframe
 
 logger = logging.getLogger(__name__)
 
+Motions = Mapping[int, KeyframeMotion]
 OTHER_DELAY_S = 0.01
 """Edges and motion may differ by so much."""
 
@@ -105,8 +107,13 @@ class SelfCalibrator:
         self._forget_masks()
         return self.state.camera != before.camera
 
-    def look_back(self, system: System, sequence: Sequence) -> bool:
-        """After the last frame: use what all frames show; whether the camera is another one now."""
+    def look_back(
+        self, system: System, sequence: Sequence, earlier: Callable[[], Motions] = dict
+    ) -> bool:
+        """After the last frame: use what all frames show; whether the camera is another one now.
+
+        ``earlier`` reads the motion of the keyframes of a map that the run has continued.
+        """
         before = self.state
         looked = before.adopted or (self.finished and not before.settled)
         if self._mode != "auto" or not looked or not isinstance(system, SlamSystem):
@@ -117,8 +124,9 @@ class SelfCalibrator:
         camera = self.state.camera
         if camera == before.camera:
             return False
+        of_keyframes, of_frames = _motions(system, sequence, camera)
         system.events.calibration(self.state.text)
-        system.use_camera(camera, *_motions(system, sequence, camera))
+        system.use_camera(camera, {**earlier(), **of_keyframes}, of_frames)
         return True
 
     def _by_edges(self, system: System, sequence: Sequence) -> SelfCalibration | None:
@@ -178,8 +186,8 @@ class SelfCalibrator:
 
 
 def _reader(system: SlamSystem, sequence: Sequence) -> SequenceDepths:
-    keyframes = system.mapper.world.keyframes.values()
-    return SequenceDepths({k.id: k.timestamp_s for k in keyframes}, sequence)
+    stamps_s = {k.id: k.timestamp_s for k in system.session_keyframes()}
+    return SequenceDepths(stamps_s, sequence)
 
 
 def _motions(
@@ -202,6 +210,6 @@ def _motions(
         return change(keyframe.timestamp_s, keyframe.features.image_pixels)
 
     return (
-        keyframe_motions(system.mapper.world, paths, of_keyframe if late else None),
+        keyframe_motions(system.session_keyframes(), paths, of_keyframe if late else None),
         frame_motions(system.frame_observations, paths, change if late else None),
     )

@@ -236,7 +236,8 @@ class CalibrationServer:
             return keypoints, depth.delay_correction(keypoints, sigmas, offset_s)
 
         retimed = offset_s != run.camera.depth_time_offset_s
-        return keyframe_motions(world, paths, change if retimed else None)
+        keyframes = world.keyframes.values()
+        return keyframe_motions(keyframes, paths, change if retimed else None)
 
 
 def _joined(*texts: str) -> str:

@@ -1,5 +1,7 @@
 """Removal by id: nothing else may change, and nothing may become underconstrained."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from graph_checks import assert_isam_matches_tables, assert_same_optimum, filled
@@ -295,6 +297,28 @@ def test_a_landmark_that_a_step_carries_through_its_cameras_is_dropped() -> None
     assert not after.rebuilt
     assert after.dropped_landmarks.tolist() == [900]
     smoother.restart()
+    assert not smoother.update(GraphUpdate()).rebuilt
+    assert_isam_matches_tables(smoother)
+    assert_same_optimum(smoother, ROOM)
+
+
+def test_a_landmark_that_is_carried_too_far_away_for_any_parallax_is_dropped() -> None:
+    """Of no depth, by measurements of another camera; GTSAM would fail at the next update."""
+    smoother = filled(ROOM)
+    poses = smoother.estimate().poses_world_camera
+    point = transform(poses[4], np.array([[0.1, 0.1, 4.0]]))
+    far = transform(poses[4], np.array([[25.0, 25.0, 1000.0]]))
+    near, measured = (
+        np.array([CAMERA.project_stereo(transform(inverse(T), p))[0] for T in poses[3:5]])
+        * [1, 1, np.nan]
+        for p in (point, far)
+    )
+    views = Observations(np.array([3, 4]), np.array([900, 900]), near, np.ones((2, 3)))
+    smoother.update(
+        GraphUpdate(landmark_ids=np.array([900]), points_world=point, observations=views)
+    )
+    found = smoother.remeasure(CAMERA, replace(views, measurements=measured))
+    assert found.dropped_landmarks.tolist() == [900]
     assert not smoother.update(GraphUpdate()).rebuilt
     assert_isam_matches_tables(smoother)
     assert_same_optimum(smoother, ROOM)

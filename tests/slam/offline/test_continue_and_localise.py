@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -183,6 +184,19 @@ def test_a_map_of_another_camera_is_not_continued(state: Arrays, tmp_path: Path)
     with pytest.raises(InputError, match=words):
         run(replace(options, map=tmp_path / "map"), FakeSystem)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("use", ["map", "localise", "camera"])
+def test_what_a_run_begins_with_is_not_overwritten(use: str, tmp_path: Path) -> None:
+    folder = tmp_path / "old"
+    run(RunOptions(make_sequence(tmp_path / "seq"), out=folder, quiet=True), FakeSystem)
+    shutil.copy(tmp_path / "seq/camera.yaml", folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    given = folder / "camera.yaml" if use == "camera" else folder
+    options = RunOptions(tmp_path / "seq", out=folder, overwrite=True, quiet=True)
+    with pytest.raises(InputError, match=f"{given}: is an input, which stays as it is; choose"):
+        run(replace(options, **{use: given}), FakeSystem)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
 @pytest.mark.parametrize(

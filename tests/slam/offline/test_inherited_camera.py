@@ -80,3 +80,17 @@ def test_a_refusal_names_what_decides_and_its_cure(sequence: Sequence, tmp_path:
         check_own_camera(tmp_path / "map", made, sequence)
     with pytest.raises(InputError, match=r"\(depth_time.*leave out --calibrate off, .*slam merge"):
         check_own_camera(tmp_path / "map", with_found(sequence.camera), sequence)
+
+
+def test_rows_that_the_run_of_the_map_found_read_upwards_are_so_again(
+    sequence: Sequence, tmp_path: Path
+) -> None:
+    """Also where a preset, which no file says, has them read downwards; what is new is of those."""
+    kinect = replace(sequence.camera, rolling_shutter_s=0.026)
+    upwards = replace(kinect, rolling_shutter_s=-0.026)
+    source = map_of(tmp_path / "map", replace(upwards, depth_time_offset_s=-0.018))
+    options = RunOptions(sequence.folder, map=source, camera=Path("kinect-v1"))
+    found = inherited_calibration(options, sequence.with_camera(kinect))
+    assert found.given == upwards
+    assert found.camera == replace(upwards, depth_time_offset_s=-0.018)
+    assert found.rows.startswith("rows are read from the bottom up")

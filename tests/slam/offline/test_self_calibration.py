@@ -27,6 +27,7 @@ from bmask_slam.calibration.adoption import (
 )
 from bmask_slam.calibration.camera_check import CameraCheck
 from bmask_slam.calibration.config import BENDS, FREE, SelfCalibrationConfig, estimated_priors
+from bmask_slam.calibration.motion import twists_at
 from bmask_slam.calibration.report import parameters_named
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import plot
@@ -38,7 +39,11 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.labelling.mask_memory import MaskMemory, RememberingSegmenter
 from bmask_slam.offline import checkpoint, frame_loop, run_end, runner
-from bmask_slam.offline.inherited_camera import inherited_calibration
+from bmask_slam.offline.inherited_camera import (
+    inherited_calibration,
+    recorded_motions,
+    use_own_camera,
+)
 from bmask_slam.offline.runner import RunOptions, RunSummary, resume, run
 from bmask_slam.offline.self_calibration import SelfCalibrator
 from bmask_slam.parallel.system import ParallelSystems
@@ -177,6 +182,47 @@ def test_the_map_of_such_a_run_is_continued_with_its_camera(
         run(dataclasses.replace(gone_on, calibrate="off"))
     later = inherited_calibration(gone_on, runner.open_sequence(late_sweep))
     assert later.camera == read_camera(found.folder / "camera.yaml")
+
+
+def test_a_run_that_continues_a_map_looks_again_and_the_map_follows(
+    late_sweep: Path, sweep_camera: Camera, quick: None, tmp_path: Path
+) -> None:
+    """Here that was too short to be looked at. The stamps of both begin with the same ones."""
+    first = run(replace(late_options(late_sweep, tmp_path / "first"), max_frames=30))
+    options = replace(late_options(late_sweep, tmp_path / "on"), map=first.folder)
+    done = run(options)
+    assert done.calibration.endswith("found and applied")
+    camera = read_camera(done.folder / "camera.yaml")
+    assert camera.depth_time_offset_s == pytest.approx(sweep_camera.depth_time_offset_s, abs=0.003)
+    assert read_run(done.folder).camera == camera
+    off = run(replace(options, out=tmp_path / "off", calibrate="off"))
+    assert ate_m(done) < 1.1 * ate_m(off)
+
+
+def test_a_map_that_is_continued_follows_a_bend_of_depth(
+    late_sweep: Path, sweep_camera: Camera
+) -> None:
+    given = sweep_camera
+    bent = replace(given, depth_distortion=(0.02, -0.01, 0.005, 0.0, 0.03))
+    tracked, system = SlamSystem(given, CONFIG), SlamSystem(given, CONFIG)
+    for frame in open_sequence(late_sweep, camera=given).frames(0, 30):
+        tracked.process(frame)
+    state = tracked.state()
+    system.restore(state, Path("map"))
+    use_own_camera(system, state, bent)
+    assert system.camera == system.mapper.camera == bent
+    keyframes = tracked.mapper.world.keyframes
+    assert len(keyframes) > 2
+    for number, before in keyframes.items():
+        after = system.mapper.world.keyframes[number].features
+        seen = before.features.image_pixels
+        expected = 1 / before.features.depth_m - bent.depth_bend(seen)
+        np.testing.assert_allclose(1 / after.depth_m, expected, atol=1e-9)
+    motions, path = recorded_motions(state), tracked.trajectory()
+    for number, keyframe in keyframes.items():
+        twist = twists_at(path, np.array([keyframe.timestamp_s]))[0]
+        np.testing.assert_allclose(motions[number].twist, twist, atol=1e-9)
+    assert np.linalg.norm(motions[max(motions)].twist) > 0.1
 
 
 @pytest.mark.parametrize("number", KILLED)
