@@ -119,7 +119,9 @@ class SelfCalibrator:
         if self._mode != "auto" or not looked or not isinstance(system, SlamSystem):
             return False
         estimate = self._estimate(system, sequence)
-        if estimate is not None:
+        if estimate is not None and estimate.in_other_order:
+            system.events.calibration(with_other_order(before, "report").text)
+        elif estimate is not None:
             self.state = judged(before, estimate, self._mode, self._config)
         camera = self.state.camera
         if camera == before.camera:

@@ -468,6 +468,22 @@ def test_a_run_keeps_the_camera_that_its_last_look_finds(
     assert texts == ["a third: found and applied", summary.calibration]
 
 
+def test_a_last_look_that_shows_the_other_order_of_rows_changes_nothing_else(
+    turned_sweep: Path,
+) -> None:
+    """What it finds of other parameters means nothing then."""
+    given = read_camera(turned_sweep / "camera.yaml")
+    adopted = replace(given, depth_time_offset_s=0.002)
+    sequence, system = open_sequence(turned_sweep, camera=adopted), SlamSystem(adopted, CONFIG)
+    for frame in sequence.frames(0, FRAMES):
+        system.process(frame)
+    calibrator = SelfCalibrator(SelfCalibration(given, adopted, "x", settled=True), "auto")
+    assert not calibrator.look_back(system, sequence)
+    assert calibrator.state.camera == system.camera == adopted
+    text = system.events.take()[-1].text
+    assert text.startswith("rows are read from the bottom up") and text.endswith("not applied")
+
+
 def _depth_error_m(system: SlamSystem, right: Sequence) -> float:
     """Root mean square, of points that the graph observes, against frames of the right camera."""
     errors = []
