@@ -15,7 +15,8 @@ import numpy as np
 from bmask_slam.calibration.edge_delay import MIN_STRENGTH, delay_warning, format_delay
 from bmask_slam.calibration.edge_scores import best_scale, edge_scores
 from bmask_slam.calibration.motion import as_exposed, landmark_motion
-from bmask_slam.calibration.views import connected_views
+from bmask_slam.calibration.rematching import RADII_PX, RunProblem
+from bmask_slam.calibration.views import SequenceDepths, connected_views
 from bmask_slam.evaluation import Row
 from bmask_slam.graph.calibration.focal_check import FocalCheck, check_focal
 from bmask_slam.graph.calibration.model import (
@@ -33,6 +34,7 @@ from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.run_folder.metrics import row
 from bmask_slam.sequences.info import depth_statistics
 from bmask_slam.sequences.sequence import Sequence
+from bmask_slam.world.world_map import WorldMap
 
 MAX_KEYFRAMES = 60
 MAX_FOCAL_CHANGE, MAX_FOCAL_BOUND = 0.015, 0.02
@@ -77,10 +79,11 @@ class _Finding:
     rows: tuple[Row, ...] = ()
 
 
-def check_camera(run: SavedRun, sequence: Sequence) -> CameraCheck:
+def check_camera(run: SavedRun, sequence: Sequence, world: WorldMap | None = None) -> CameraCheck:
     """Compare a run's camera with its stored observations, and depth images with colour images.
 
-    ``sequence`` must have the camera of the run.
+    ``sequence`` must have the camera of the run. With the run's ``world`` a focal length that the
+    stored observations doubt is asked of landmarks that are found again, too.
 
     Raises:
         InputError: an image that the run could read is missing or broken.
@@ -88,8 +91,11 @@ def check_camera(run: SavedRun, sequence: Sequence) -> CameraCheck:
     path = run.trajectories["trajectory.txt"]
     problem = stored_problem(run) if len(path) else None
     focal = check_focal(problem) if problem is not None else None
+    again = None
+    if focal is not None and world is not None and abs(focal.change) > MAX_FOCAL_CHANGE:
+        again = _focal_again(run, sequence, world)
     registration = register(edge_scores(sequence, path))
-    findings = [_focal(focal, run.camera), _Finding(SCALE_NOTE)]
+    findings = [_focal(focal, again, run.camera), _Finding(SCALE_NOTE)]
     if registration is not None and registration.strength >= MIN_STRENGTH:
         findings += [_shift(registration, run.camera), _delay(registration, run.camera)]
     elif registration is not None:
@@ -151,9 +157,24 @@ def stored_problem(run: SavedRun) -> CalibrationProblem | None:
     return CalibrationProblem(views, poses, points, start, np.zeros(len(PARAMETERS)), GAUGE_SIGMAS)
 
 
-def _focal(check: FocalCheck | None, camera: Camera) -> _Finding:
+def _focal_again(run: SavedRun, sequence: Sequence, world: WorldMap) -> FocalCheck | None:
+    """What landmarks say that are found again without the run's own choice of matches.
+
+    Tracking keeps a match only if it fits the camera, so that stored observations show about two
+    thirds of an error, and what else is wrong with them besides.
+    """
+    ids, stamps_s = run.tables.keyframes.ids.tolist(), run.keyframe_stamps_s.tolist()
+    reader = SequenceDepths(dict(zip(ids, stamps_s, strict=True)), sequence)
+    landmarks = RunProblem(world, run, reader, run.camera)
+    if not landmarks.large_enough:
+        return None
+    return check_focal(landmarks.problem(run.camera.rolling_shutter_s, RADII_PX[-1]))
+
+
+def _focal(check: FocalCheck | None, again: FocalCheck | None, camera: Camera) -> _Finding:
     if check is None:
         return _Finding("focal length: not observable, too few views")
+    check = again or check
     change, bound = 100 * check.change, 100 * NORMAL_95 * check.sigma
     rows = (row("camera_focal_change", change, "%"), row("camera_focal_change_95", bound, "%"))
     more = "more" if change > 0 else "less"

@@ -124,7 +124,7 @@ def _camera_checked(run: ActiveRun) -> CameraCheck:
         logger.warning("camera: %s", unit)
         return CameraCheck((unit,), (), (row("camera_warnings", 1, "1"),))
     try:
-        checked = check_camera(run.system.as_run(), run.sequence)
+        checked = check_camera(run.system.as_run(), run.sequence, run.system.mapper.world)
     except InputError as error:
         logger.info("camera not checked: %s", error)
         return nothing

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from shifted_stamps import with_depth_stamps
 
+from bmask_slam.calibration import camera_check
 from bmask_slam.calibration.adoption import SelfCalibration
 from bmask_slam.calibration.camera_check import (
     CameraCheck,
@@ -23,13 +24,16 @@ from bmask_slam.calibration.edge_delay import delay_warning, sure_registration, 
 from bmask_slam.calibration.edge_scores import correlation, edge_scores, edges_of
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import plot
+from bmask_slam.graph.calibration.focal_check import FocalCheck
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import part
 from bmask_slam.offline.runner import RunOptions, RunSummary, run
-from bmask_slam.run_folder.map_file import read_run
+from bmask_slam.run_folder.map_file import read_map, read_run
 from bmask_slam.sequences.cameras import write_camera
 from bmask_slam.sequences.sequence import open_sequence
 from bmask_slam.system_config import SystemConfig
+from bmask_slam.world.map_state import world_of
 
 CONFIG = resolve(
     SystemConfig, None, ("semantics.segmenter.name=none", "features.max_keypoints=400")
@@ -101,6 +105,21 @@ def test_a_wrong_focal_length_is_named(
     (warning,) = _run_with(wrong, late_sweep, tmp_path).warnings
     assert warning.startswith("focal length") and "bmask-slam calibrate" in warning
     assert (" % less than" if share > 0 else " % more than") in warning
+
+
+def test_what_only_the_matches_of_tracking_say_of_the_focal_length_is_no_warning(
+    right: RunSummary, late_sweep: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Landmarks that are found again decide."""
+    stored, again = FocalCheck(0.024, 0.003, (0.02, 0.02)), FocalCheck(0.004, 0.003, (0.01, -0.01))
+    answers = [stored, again]
+    monkeypatch.setattr(camera_check, "check_focal", lambda problem: answers.pop(0))
+    state, camera = read_map(right.folder)
+    run, sequence = read_run(right.folder), open_sequence(late_sweep, camera=camera)
+    found = check_camera(run, sequence, world_of(part(state, "mapper.world")))
+    assert not answers and found.warnings == ()
+    rows = {row["name"]: row["value"] for row in found.rows}
+    assert rows["camera_focal_change"] == pytest.approx(0.4)
 
 
 def test_shifted_depth_is_named_with_the_shift_that_cures(
