@@ -40,6 +40,9 @@ MAX_KEYFRAMES = 60
 MAX_FOCAL_CHANGE, MAX_FOCAL_BOUND = 0.015, 0.02
 """A focal length surely further off, as a share of it, is a warning; it is not observable if its
 95 % bound is larger than the second."""
+SHOWN_BY_TRACKED = 2 / 3
+"""What was tracked with a wrong focal length shows so much of the error, as it was kept since it
+fits; what is found again shows all of it."""
 MAX_SHIFT_SHARE = 4 / 640
 """Depth surely further off in the image, as a share of its width, is not registered."""
 MIN_STRENGTH_RATIO, MIN_SCALE_CHANGE = 1.5, 0.05
@@ -158,11 +161,7 @@ def stored_problem(run: SavedRun) -> CalibrationProblem | None:
 
 
 def _focal_again(run: SavedRun, sequence: Sequence, world: WorldMap) -> FocalCheck | None:
-    """What landmarks say that are found again without the run's own choice of matches.
-
-    Tracking keeps a match only if it fits the camera, so that stored observations show about two
-    thirds of an error, and what else is wrong with them besides.
-    """
+    """What landmarks say that are found again without the run's own choice of matches."""
     ids, stamps_s = run.tables.keyframes.ids.tolist(), run.keyframe_stamps_s.tolist()
     reader = SequenceDepths(dict(zip(ids, stamps_s, strict=True)), sequence)
     landmarks = RunProblem(world, run, reader, run.camera)
@@ -174,12 +173,14 @@ def _focal_again(run: SavedRun, sequence: Sequence, world: WorldMap) -> FocalChe
 def _focal(check: FocalCheck | None, again: FocalCheck | None, camera: Camera) -> _Finding:
     if check is None:
         return _Finding("focal length: not observable, too few views")
-    check = again or check
+    limit = MAX_FOCAL_CHANGE
+    if again is not None:
+        check, limit = again, MAX_FOCAL_CHANGE / SHOWN_BY_TRACKED
     change, bound = 100 * check.change, 100 * NORMAL_95 * check.sigma
     rows = (row("camera_focal_change", change, "%"), row("camera_focal_change_95", bound, "%"))
     more = "more" if change > 0 else "less"
     shown = f"{abs(change):.1f} ± {bound:.1f} % {more} than the camera's {camera.fx:.1f} px"
-    if check.surely_beyond(MAX_FOCAL_CHANGE):
+    if check.surely_beyond(limit):
         text = f"focal length: the motion shows {shown}; check the calibration, or find it by "
         return _Finding(f"{text}bmask-slam calibrate RUN", True, rows)
     if NORMAL_95 * check.sigma > MAX_FOCAL_BOUND:

@@ -51,10 +51,11 @@ def inherited_calibration(options: RunOptions, sequence: Sequence) -> SelfCalibr
     camera = with_found_of(made, given, said)
     if camera == given or set(_differing(made, camera)) - said:
         return SelfCalibration(given, given)
-    rows = ""
+    text, rows = f"camera as found by {source}", ""
     if given.rolling_shutter_s * camera.rolling_shutter_s < 0:
-        given, rows = in_other_order(given), UPWARDS if given.rolling_shutter_s > 0 else DOWNWARDS
-    return SelfCalibration(given, camera, f"camera as found by {source}", rows=rows)
+        given = in_other_order(given)
+        rows = UPWARDS if given.rolling_shutter_s < 0 else DOWNWARDS
+    return SelfCalibration(given, camera, text, rows=rows)
 
 
 def with_found_of(made: Camera, camera: Camera, but: Container[str] = ()) -> Camera:
@@ -66,7 +67,7 @@ def with_found_of(made: Camera, camera: Camera, but: Container[str] = ()) -> Cam
 def use_own_camera(system: SlamSystem, state: Arrays, camera: Camera) -> None:
     """Let a system with the map of a state go on with the camera that was found since.
 
-    Of the keyframes before, depth has no other delay then, as their images are not at hand.
+    Depths of its keyframes keep their delay, as their images are not at hand.
     """
     if camera != system.camera:
         logger.info("the map follows the camera of this run: %s", camera)

@@ -126,9 +126,15 @@ class SelfCalibrator:
         camera = self.state.camera
         if camera == before.camera:
             return False
+        try:
+            motions = earlier()
+        except InputError as error:  # the map was there when the run began
+            logger.warning("the camera stays as it was: %s", error)
+            self.state = before
+            return False
         of_keyframes, of_frames = _motions(system, sequence, camera)
         system.events.calibration(self.state.text)
-        system.use_camera(camera, {**earlier(), **of_keyframes}, of_frames)
+        system.use_camera(camera, {**motions, **of_keyframes}, of_frames)
         return True
 
     def _by_edges(self, system: System, sequence: Sequence) -> SelfCalibration | None:

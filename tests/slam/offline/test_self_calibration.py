@@ -17,6 +17,7 @@ import pytest
 from fake_run import FakeSystem, make_sequence
 from shifted_stamps import with_depth_stamps
 
+from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.calibration.adoption import (
     Estimate,
     SelfCalibration,
@@ -415,6 +416,10 @@ def test_a_much_surer_bend_takes_the_place_of_one_that_it_does_not_contradict(
     assert after == first or after.bend_sigma < first.bend_sigma
 
 
+def _gone() -> dict[int, KeyframeMotion]:
+    raise InputError("runs/first/map: there is no saved map here")
+
+
 @pytest.mark.parametrize("parallel", [False, True])
 def test_after_the_last_frame_keyframes_get_the_depth_of_the_camera_found(
     late_sweep: Path, sweep_camera: Camera, parallel: bool
@@ -432,6 +437,7 @@ def test_after_the_last_frame_keyframes_get_the_depth_of_the_camera_found(
         state = SelfCalibration(given, third, "a third", settled=True)
         calibrator = SelfCalibrator(state, "auto")
         assert not SelfCalibrator(state, "off").look_back(system, sequence)
+        assert not calibrator.look_back(system, sequence, _gone) and calibrator.state is state
         assert calibrator.look_back(system, sequence)
         assert not calibrator.look_back(system, sequence.with_camera(system.camera))
         text = system.events.take()[-1].text
