@@ -83,8 +83,7 @@ class SystemResults(ABC):
     def trajectory(self) -> Trajectory:
         """Every frame with a pose in the largest segment, from the keyframes as they are now."""
         nothing = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
-        segments = self.segments()
-        return segments.get(self._largest(segments), nothing)
+        return self.segments().get(self.largest_segment(), nothing)
 
     def segments(self) -> dict[int, Trajectory]:
         """The frames of every map segment, each in the segment's own coordinate frame."""
@@ -92,11 +91,7 @@ class SystemResults(ABC):
 
     def largest_segment(self) -> int:
         """The mapped segment with most frames, any if none is; the older of equal ones."""
-        return self._largest(self.segments())
-
-    def _largest(self, segments: dict[int, Trajectory]) -> int:
-        mapped = self.map.world.mapped_segments()
-        return max(segments, key=lambda s: (s in mapped, len(segments[s]), -s), default=0)
+        return self.map.history.largest_segment(self.map.world)
 
     def keyframe_trajectory(self) -> Trajectory:
         """The keyframes of the largest segment that this session made.

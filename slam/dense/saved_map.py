@@ -21,6 +21,7 @@ from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.objects.gravity import most_common, sides_of
 from bmask_slam.sequences.right_images import RIGHT_LIST, RightImages, read_right_images
 from bmask_slam.sequences.sequence import Sequence, open_sequence
+from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_state import world_of
 from bmask_slam.world.world_map import WorldMap
@@ -28,6 +29,8 @@ from bmask_slam.world.world_map import WorldMap
 logger = logging.getLogger(__name__)
 
 MAX_LENGTH_ERROR = 1e-3
+NO_INFORMATION = {"information": np.zeros((0, 6, 6))}
+"""What the frames of files of older versions lack, which is not needed here."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +40,7 @@ class SavedMap:
     Attributes:
         path: the run folder.
         world: the map.
-        keyframes: those of its largest segment that its recording shows, oldest first.
+        keyframes: those of the segment of trajectory.txt that its recording shows, oldest first.
         camera: of the images, with distortion.
         labels: the classes of its landmarks; None if the run had no segmenter.
         sides: the side of keyframes' images that is up, of `graph.camera.SIDES`, by keyframe id; ""
@@ -137,8 +140,10 @@ def read_saved_map(path: Path) -> SavedMap:
     """The map of a run folder, without its images. Raises InputError if there is none."""
     state, camera = read_map(path)
     with fitting(path / MAP):
-        world = world_of(part(state, "mapper.world"))
-        segment = world.largest_segment()
+        world, history = world_of(part(state, "mapper.world")), FrameHistory()
+        if frames := part(state, "mapper.history"):
+            history.restore(NO_INFORMATION | frames)
+        segment = history.largest_segment(world)
         labels = saved_labels(part(state, "semantics"), path)
         up_world = _measured_up(part(state, "mapper.graph"), segment)
         sides = _sides(part(state, "semantics.upright"))

@@ -74,12 +74,12 @@ class LiveMap(SensorInput):
 
     def segment(self) -> int:
         """The number of the largest map segment, which ``map`` and ``trajectory`` are of."""
-        return self._system.map.world.largest_segment()
+        return self._system.largest_segment()
 
     def keyframe_poses(self) -> dict[int, Array]:
         """The present T_world_camera (4, 4) of the keyframes of the largest segment, by id."""
-        world = self._system.map.world
-        return {k.id: k.T_world_camera for k in world.in_segment(world.largest_segment())}
+        shown = self._system.map.world.in_segment(self.segment())
+        return {k.id: k.T_world_camera for k in shown}
 
     def objects(self) -> MapObjects | None:
         """The objects as the map's process told them last; it is asked for newer ones.
@@ -90,8 +90,7 @@ class LiveMap(SensorInput):
         if system.segmenter is None:
             return None
         if system.map is not system.remote:  # it has ended
-            world = system.map.world
-            return system.semantics.map_objects(world.in_segment(world.largest_segment()))
+            return system.objects()
         system.remote.ask_for_objects()
         return system.remote.objects
 

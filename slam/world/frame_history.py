@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from graphlib import TopologicalSorter
 
@@ -86,6 +87,23 @@ class FrameHistory:
         found = {segment: path for segment, _, _, path in self._segments(world)}
         self._entries.release()
         return found
+
+    def largest_segment(self, world: WorldMap) -> int:
+        """The mapped segment with most frames, any if none is; the older of equal ones.
+
+        Its frames are trajectory.txt. Without frames it is the one with most keyframes.
+        """
+        ids, counts = np.unique(self._store["keyframe_id"][: self._size], return_counts=True)
+        frames: Counter[int] = Counter()
+        for keyframe_id, count in zip(ids.tolist(), counts.tolist(), strict=True):
+            owner, _ = self.parent(keyframe_id)
+            if owner != NO_KEYFRAME:
+                frames[world.keyframes[owner].segment] += count
+        self._entries.release()
+        if not frames:
+            return world.largest_segment()
+        mapped = world.mapped_segments()
+        return max(frames, key=lambda s: (s in mapped, frames[s], -s))
 
     def smooth(self, world: WorldMap) -> None:
         """Give the frames the poses that the camera's inertia makes the most probable."""

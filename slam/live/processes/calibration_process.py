@@ -274,7 +274,7 @@ def read_state(
     stamps_s = {k.id: k.timestamp_s for k in world.keyframes.values()}
     stamps = np.array([stamps_s.get(i, np.nan) for i in tables.keyframes.ids.tolist()])
     nothing = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
-    path_of_all = paths.get(world.largest_segment(), nothing)
+    path_of_all = paths.get(history.largest_segment(world), nothing)
     trajectories = {"trajectory.txt": path_of_all}
     run = SavedRun(path, tables, camera, config, stamps, trajectories, nothing, {})
     return run, world, paths

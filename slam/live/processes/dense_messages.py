@@ -101,7 +101,7 @@ class MapPoses:
     @classmethod
     def of(cls, world: WorldMap, history: FrameHistory, followed: Set[int]) -> MapPoses:
         """As they are now; ``followed`` are keyframes that may have been culled."""
-        segment = world.largest_segment()
+        segment = history.largest_segment(world)
         poses = {k.id: k.T_world_camera for k in world.in_segment(segment)}
         for culled in followed - world.keyframes.keys():
             parent, T_parent_culled = history.parent(culled)

@@ -196,10 +196,9 @@ class MapServer:
 
     def answer(self, message: TellObjects | SaveMap) -> None:
         """Send the objects of the largest segment, or write the map for other runs."""
-        world, failure = self.system.mapper.world, ""
+        failure = ""
         if isinstance(message, TellObjects):
-            keyframes = world.in_segment(world.largest_segment())
-            self._send(ObjectsTold(self.system.semantics.map_objects(keyframes)))
+            self._send(ObjectsTold(self.system.objects()))
             return
         try:
             self.system.save_map(message.path)

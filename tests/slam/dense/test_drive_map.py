@@ -23,7 +23,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import GRAVITY, RelativePose, reference_frame_id
-from bmask_slam.graph.files.array_file import nested, read_arrays, write_arrays
+from bmask_slam.graph.files.array_file import nested, part, read_arrays, write_arrays
 from bmask_slam.graph.geometry import inverse, make_pose, so3_exp, transform
 from bmask_slam.graph.smoother.storage import graph_arrays
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap, write_depth_map
@@ -32,8 +32,9 @@ from bmask_slam.mapping.products.cloud_files import CloudWriter
 from bmask_slam.mapping.products.occupancy import FREE, OCCUPIED
 from bmask_slam.run_folder.landmark_file import DenseCloud
 from bmask_slam.run_folder.map_file import MAP_FILE, write_map
+from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.keyframe import Keyframe
-from bmask_slam.world.map_state import world_state
+from bmask_slam.world.map_state import world_of, world_state
 from bmask_slam.world.world_map import WorldMap
 
 CAMERA = Camera(80, 60, 50.0, 50.0, 39.5, 29.5)
@@ -281,6 +282,26 @@ def test_the_command_writes_an_octomap(
     occupied = np.array([key for key, is_occupied in voxels.items() if is_occupied])
     assert set(occupied[:, 2]) <= {-1, 0, 7}  # the floor and the table, seen from above
     assert min(key[2] for key, is_occupied in voxels.items() if not is_occupied) >= 0
+
+
+def test_the_map_is_of_the_segment_that_the_trajectory_is_of(run: Path) -> None:
+    """That of most frames; not that of most keyframes, which has a world frame of its own."""
+    header, state = read_arrays(run / "map", MAP_FILE)
+    world, history = WorldMap(), FrameHistory()
+    first = world_of(part(state, "mapper.world")).keyframes[0]
+    for number, segment in enumerate((0, 1, 1)):
+        world.add_keyframe(replace(first, id=number, segment=segment))
+    for k, keyframe in enumerate((0, 0, 0, 1, 2)):
+        history.append(float(k), keyframe, np.eye(4), np.eye(4))
+    state |= nested(mapper=nested(world=world_state(world), history=history.state()))
+    write_arrays(run / "map", MAP_FILE, header, state)
+    assert world.largest_segment() == 1
+    assert [k.id for k in read_saved_map(run).keyframes] == [0]
+    history.append(5.0, 2, np.eye(4), np.eye(4))
+    history.append(6.0, 2, np.eye(4), np.eye(4))
+    state |= nested(mapper=nested(history=history.state()))
+    write_arrays(run / "map", MAP_FILE, header, state)
+    assert [k.id for k in read_saved_map(run).keyframes] == [1, 2]
 
 
 def test_up_without_a_direction_is_refused(run: Path) -> None:

@@ -356,6 +356,18 @@ def test_poses_of_culled_keyframes_are_those_that_their_parents_give_them() -> N
     np.testing.assert_allclose(found[3], POSES[3], atol=1e-12)
 
 
+def test_the_surface_follows_the_segment_of_most_frames() -> None:
+    """That which trajectory.txt is of, also where another one has more keyframes."""
+    world, history = WorldMap(), FrameHistory()
+    for k, segment in ((0, 5), (1, 0), (2, 0)):
+        keyframe = Keyframe.__new__(Keyframe)
+        keyframe.id, keyframe.segment, keyframe.T_world_camera = k, segment, POSES[k]
+        world.keyframes[k] = keyframe
+    for k in range(3):
+        history.append(0.1 * k, 0, POSES[0], POSES[0])
+    assert sorted(MapPoses.of(world, history, set()).by_id()) == [0]
+
+
 def test_removal_reaches_the_surface(tmp_path) -> None:
     server = with_keyframes(make_server(tmp_path / "run"))
     worked(server)

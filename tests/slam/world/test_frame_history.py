@@ -6,7 +6,7 @@ from synthetic_view import add_keyframe, make_features
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.frame_history import NO_KEYFRAME, FrameHistory
 from bmask_slam.world.world_map import WorldMap
 
 RNG = np.random.default_rng(6)
@@ -140,3 +140,18 @@ def test_frames_can_be_placed_by_their_stamps() -> None:
     for segment, rows in ((0, [0, 1]), (1, [2, 3, 4, 5])):
         found = history.trajectories(world)[segment].poses_world_camera
         np.testing.assert_allclose(found, frames[rows], atol=1e-12)
+
+
+def test_the_largest_segment_is_that_of_most_frames() -> None:
+    """Two keyframes have two frames, one that replaces a culled one has four."""
+    keyframe_poses, frames = random_poses(4), random_poses(6)
+    world, history = world_of(keyframe_poses, (0, 0, 1, 1)), FrameHistory()
+    assert history.largest_segment(world) == world.largest_segment() == 0
+    for i, keyframe in enumerate((0, 1, 2, 2, 3, 3)):
+        history.append(i / 30, keyframe, keyframe_poses[keyframe], frames[i])
+    history.hand_over(3, 2, np.eye(4))
+    del world.keyframes[3]
+    assert world.largest_segment() == 0 and history.largest_segment(world) == 1
+    assert len(history.trajectories(world)[1]) == 4
+    history.hand_over(2, NO_KEYFRAME, np.eye(4))
+    assert history.largest_segment(world) == 0
