@@ -98,7 +98,8 @@ def evaluate_trajectory(
         raise InputError(
             f"{len(matched)} of {len(estimate)} poses have a reference pose within "
             f"{max_time_difference_s:g} s, at least {MIN_POSES} are needed; estimate "
-            f"{_span(estimate)}, reference {_span(reference)}: use the same clock in both"
+            f"{_span(estimate)}, reference {_span(reference)}: "
+            + ("use the same clock in both" if len(estimate) >= MIN_POSES else "give a longer run")
         )
     absolute = absolute_error(matched, truth, with_scale)
     scaled = absolute.alignment.apply(matched) if with_scale else matched

@@ -65,7 +65,7 @@ def finish_run(run: ActiveRun) -> RunSummary:
     if stopped_by is not None:
         rows.append(row(STOPPED, counters.frames, "frames"))
     title = "-".join(filter(None, (run.sequence.name, options.config_name)))
-    save(run.system, run.folder, rows, run.reference, title)
+    apart = save(run.system, run.folder, rows, run.reference, title)
     if options.dense:
         from bmask_slam.dense.map_run import map_run  # noqa: PLC0415 - loads torch
 
@@ -87,6 +87,7 @@ def finish_run(run: ActiveRun) -> RunSummary:
         + weakly_tracked(
             folder / FRAMES, options.config.tracking.min_inliers, bool(options.localise)
         )
+        + apart
         + checked.warnings
         + _unwritten_checkpoints(run),
     )

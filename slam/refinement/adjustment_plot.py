@@ -18,6 +18,7 @@ from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment, loop_edges
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
+from bmask_slam.graph.factors.observability import component_labels, shared_landmarks
 from bmask_slam.graph.files.whole_file import check_target, whole_file
 
 PICTURE_TYPES = (".png", ".pdf", ".svg")
@@ -25,24 +26,45 @@ PICTURE_TYPES = (".png", ".pdf", ".svg")
 
 @dataclass(frozen=True, eq=False)
 class GraphSnapshot:
-    """A copy of a graph's keyframes (K) and landmarks (L), and the ends (N, 2) of its loops."""
+    """A copy of a graph's keyframes (K) and landmarks (L), and the ends (N, 2) of its loops.
+
+    Attributes:
+        path: (M, 2) rows of keyframes that follow each other and share landmarks: what the camera
+            passed between. Not where it was lost, nor where another recording begins.
+        part: rows of the keyframes in the largest part of the graph. Other parts, as map segments
+            that were never joined, have worlds of their own; what observes nothing is in none.
+        cloud: rows of the landmarks that these keyframes observe.
+    """
 
     keyframe_ids: Ints
     poses_world_camera: Array
     landmark_ids: Ints
     points_world: Array
     loops: Ints
+    path: Ints
+    part: Ints
+    cloud: Ints
 
     @classmethod
     def of(cls, tables: FactorTables) -> GraphSnapshot:
         """The graph as it is now."""
         keyframes, landmarks = tables.keyframes, tables.landmarks
+        ids, seen = keyframes.ids.copy(), tables.observations.all()
+        linked = np.flatnonzero(shared_landmarks(ids, seen).diagonal(1))
+        edges = [entry.keyframes for entry in tables.pose_factors.values()]
+        parts, observing = component_labels(ids, seen, edges), np.isin(ids, seen.keyframe_ids)
+        largest = np.bincount(parts[observing], minlength=1).argmax()
+        part = np.flatnonzero(observing & (parts == largest))
+        observed = seen.landmark_ids[np.isin(seen.keyframe_ids, ids[part])]
         return cls(
-            keyframes.ids.copy(),
+            ids,
             keyframes.values.copy(),
             landmarks.ids.copy(),
             landmarks.values.copy(),
             loop_edges(tables),
+            linked[:, None] + np.array([0, 1]),
+            part,
+            np.flatnonzero(np.isin(landmarks.ids, observed)),
         )
 
 
@@ -88,23 +110,32 @@ def draw_before_after(path: Path, before: View, after: View) -> None:
 def draw_adjustment(
     path: Path, before: GraphSnapshot, after: GraphSnapshot, adjustment: Adjustment
 ) -> None:
-    """Draw path, loops (wrong ones red) and landmarks, seen along the axis of least motion."""
-    plane = view_plane(after.poses_world_camera[:, :3, 3])
-    ends = np.arange(len(before.keyframe_ids))
-    path_edges = np.stack([ends[:-1], ends[1:]], axis=1)
+    """Draw path, loops (wrong ones red) and landmarks, seen along the axis of least motion.
+
+    Of a graph in parts, each with a world of its own, the largest one.
+    """
+    part = before.part if len(before.part) else np.arange(len(before.keyframe_ids))
+    ids, cloud = before.keyframe_ids[part], before.landmark_ids[before.cloud]
+    plane = view_plane(after.poses_world_camera[part, :3, 3])
     views = []
     for state, cost, title in (
         (before, adjustment.initial_cost, "before"),
         (after, adjustment.final_cost, "after"),
     ):
-        loops = np.searchsorted(before.keyframe_ids, state.loops)
-        wrong = np.searchsorted(before.keyframe_ids, adjustment.wrong_loops)
-        edges = [(path_edges, "tab:blue", 0.9), (loops, "tab:green", 0.6)]
-        edges += [(wrong, "tab:red", 0.6)] if state is before else []
-        positions = state.poses_world_camera[:, :3, 3][:, plane]
-        cloud, axes = state.points_world[:, plane], "".join("xyz"[k] for k in plane)
-        views.append(View(f"{title}, cost {cost:.5g}", positions, edges, cloud, axes))
+        edges = [(_rows(ids, before.keyframe_ids[before.path]), "tab:blue", 0.9)]
+        edges += [(_rows(ids, state.loops), "tab:green", 0.6)]
+        edges += [(_rows(ids, adjustment.wrong_loops), "tab:red", 0.6)] if state is before else []
+        positions = state.poses_world_camera[part, :3, 3][:, plane]
+        points = state.points_world[np.isin(state.landmark_ids, cloud)][:, plane]
+        axes = "".join("xyz"[k] for k in plane)
+        views.append(View(f"{title}, cost {cost:.5g}", positions, edges, points, axes))
     draw_before_after(path, *views)
+
+
+def _rows(ids: Ints, edges: Ints) -> Ints:
+    """Rows (M, 2) among the sorted ids of the edges (N, 2) that are between two of them."""
+    edges = np.asarray(edges, np.int64).reshape(-1, 2)
+    return np.searchsorted(ids, edges[np.isin(edges, ids).all(axis=1)])
 
 
 def _draw(axes: Any, view: View) -> None:

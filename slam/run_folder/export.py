@@ -101,8 +101,16 @@ def _graph(source: Path, out: Path) -> Exported:
         f"{len(tables.keyframes.ids)} keyframes (VERTEX_SE3:QUAT), {len(tables.landmarks.ids)} "
         f"landmarks (VERTEX_TRACKXYZ), {len(seen)} observations (EDGE_PROJECT_DISPARITY; {flat} "
         f"without depth: no information on 1/z), {edges} relative poses and priors.\n"
-        f"Not in the format: the robust kernels of observations{lacking}, and what is in comments.",
+        f"Not in the format: the robust kernels of observations{lacking}, and what is in comments."
+        f"{_segments_in(source)}",
     )
+
+
+def _segments_in(source: Path) -> str:
+    """A line of a graph that is not of one world, as it is of all map segments; "" of one."""
+    count = len(trajectory_files(source)) - 1
+    text = "{} more map segments are in it, each in a world of its own; no edge joins them"
+    return f"\n{text.format(count)}" if count else ""
 
 
 def _points_of_graph(source: Path, form: ExportFormat, out: Path) -> Exported:

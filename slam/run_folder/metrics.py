@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +20,8 @@ from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 logger = logging.getLogger(__name__)
 
+MOST_NAMED = 3
+"""Files of map segments that a warning names."""
 EVALUATION_ROWS = (
     "ate_rmse",
     "rpe_trans_rmse_frame",
@@ -100,29 +103,48 @@ def _percentiles(name: str, values_ms: list[float]) -> list[Row]:
     return [row(f"{name}_median", float(median), "ms"), row(f"{name}_p95", float(high), "ms")]
 
 
-def save_poses_and_points(system: System, folder: RunFolder) -> None:
+def save_poses_and_points(system: System, folder: RunFolder) -> tuple[str, ...]:
     """Write all poses, and the landmarks: what there is even where the graph was lost.
 
-    Every map segment that is not joined to the largest has a file of its own.
+    Every map segment that is not joined to the largest has a file of its own; if there are any, a
+    warning says so, which is logged too.
     """
-    trajectory = system.trajectory()
+    trajectory, apart = system.trajectory(), dict[str, Trajectory]()
     folder.write_trajectory(trajectory)
     folder.write_trajectory(system.keyframe_trajectory(), "keyframes.txt")
     for number, segment in system.segments().items():
         if segment.timestamps_s[0] not in trajectory.timestamps_s:
-            folder.write_trajectory(segment, f"trajectory_segment_{number}.txt")
+            apart[f"trajectory_segment_{number}.txt"] = segment
+    for name, segment in apart.items():
+        folder.write_trajectory(segment, name)
     landmarks = system.landmarks()
     folder.written(lambda path: write_landmarks(path / "landmarks.ply", landmarks))
+    if not apart:
+        return ()
+    text = _told_apart(len(trajectory), apart)
+    logger.warning(text)
+    return (text,)
+
+
+def _told_apart(frames: int, apart: Mapping[str, Trajectory]) -> str:
+    """What a run says whose map fell into parts."""
+    theirs = sum(map(len, apart.values()))
+    names = ", ".join([*list(apart)[:MOST_NAMED], *(["..."] if len(apart) > MOST_NAMED else [])])
+    return (
+        f"map: {theirs} of {frames + theirs} frames with a pose are in {len(apart)} segments that "
+        f"were never recognised in the largest, each in a world of its own ({names}); "
+        f"trajectory.txt, landmarks, objects and dense map are of the largest, {frames} frames"
+    )
 
 
 def save(
     system: System, folder: RunFolder, rows: list[Row], reference: Trajectory | None, title: str
-) -> None:
-    """Write the result files."""
+) -> tuple[str, ...]:
+    """Write the result files; returns a warning where the map is in several segments."""
     from bmask_slam.evaluation.plot import plot_trajectory  # noqa: PLC0415 - matplotlib is large
 
     trajectory = system.trajectory()
-    save_poses_and_points(system, folder)
+    warnings = save_poses_and_points(system, folder)
     files = system.files()
     for name, write in files.items():
         folder.write_file(name, write)
@@ -133,3 +155,4 @@ def save(
     for name in files:
         size_mb = (folder.path / name).stat().st_size / 1e6
         logger.info("%s: %.1f MB", name, size_mb)
+    return warnings

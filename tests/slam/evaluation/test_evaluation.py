@@ -187,6 +187,16 @@ def test_picture(tmp_path, with_reference):
     assert path.read_bytes() == before
 
 
+@pytest.mark.parametrize(
+    ("estimated", "late_s", "cure"), [(2, 0.0, "give a longer run"), (5, 99.0, "the same clock")]
+)
+def test_too_few_common_poses_are_refused_with_their_cure(estimated, late_s, cure):
+    stamps_s, poses = np.arange(5) / 10, np.tile(np.eye(4), (5, 1, 1))
+    estimate = Trajectory(stamps_s[:estimated] + late_s, poses[:estimated])
+    with pytest.raises(InputError, match=f"at least 3 are needed.*: .*{cure}"):
+        evaluate_trajectory(estimate, Trajectory(stamps_s, poses))
+
+
 def test_picture_of_an_empty_trajectory(tmp_path):
     """A run that was lost from the start still has a picture."""
     empty = arc().select(np.arange(0))

@@ -347,3 +347,29 @@ def test_real_frames_twice_give_the_same_bytes(tmp_path: Path) -> None:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     assert values(summaries[0])["tracked_share"] == 1
     assert values(summaries[0])["ate_rmse"] < 0.02
+
+
+class FakeSegments(FakeSystem):
+    """Its frames from the tenth on are a map segment of their own, which is never joined."""
+
+    def segments(self) -> dict[int, Trajectory]:
+        path, first = super().trajectory(), np.array(self.numbers) < 10
+        return {0: path.select(np.flatnonzero(first)), 1: path.select(np.flatnonzero(~first))}
+
+    def trajectory(self) -> Trajectory:
+        return self.segments()[0]
+
+    def keyframe_trajectory(self) -> Trajectory:
+        return self.trajectory().select(np.arange(0, 9, 5))
+
+
+def test_map_segments_that_were_never_joined_are_said(
+    sequence: Path, out: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    summary = run(RunOptions(sequence, out=out, quiet=True), FakeSegments)
+    told = "map: 9 of 18 frames with a pose are in 1 segments that were never recognised in the"
+    (warning,) = (text for text in summary.warnings if text.startswith("map:"))
+    assert warning.startswith(told) and "(trajectory_segment_1.txt)" in warning
+    assert warning in caplog.messages and warning in (out / "log.txt").read_text()
+    assert len(read_tum(out / "trajectory_segment_1.txt")) == 9
+    assert not [text for text in fake_run(sequence, out, overwrite=True).warnings if "map:" in text]

@@ -12,7 +12,10 @@ from repository import KITCHEN, shared
 from bmask_slam import cli
 from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.batch.bundle_adjustment import Adjustment, Stage
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.factor_tables import FactorTables
+from bmask_slam.graph.factors.graph_update import Observations, reference_frame_id
 from bmask_slam.graph.files.array_file import part
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
@@ -20,8 +23,14 @@ from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_exp
 from bmask_slam.graph.smoother.storage import read_graph, write_graph
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
 from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.refinement import adjustment_plot
 from bmask_slam.refinement.adjustment import AdjustOptions, adjust_run
-from bmask_slam.refinement.adjustment_plot import View, draw_before_after
+from bmask_slam.refinement.adjustment_plot import (
+    GraphSnapshot,
+    View,
+    draw_adjustment,
+    draw_before_after,
+)
 from bmask_slam.refinement.carried_along import move_frames
 from bmask_slam.run_folder.map_file import read_map, read_run, write_map
 from bmask_slam.system_config import SystemConfig
@@ -294,6 +303,33 @@ def test_impossible_options_are_refused(capsys, kitchen: Path, tmp_path: Path) -
     assert "do not belong together" in error(other, "--out", tmp_path / "new")
     (other / "frames.csv").unlink()
     assert "frames.csv: no such file" in error(other, "--out", tmp_path / "new")
+
+
+def test_the_picture_is_of_one_world_and_has_no_line_where_the_camera_was_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Keyframes 0 to 3 are of one map, where 2 shows nothing of 1; 7 and 8 are of another one.
+
+    The pose that a sensor has in the graph is none of the camera.
+    """
+    tables, views = FactorTables(), list[View]()
+    ids = np.array([0, 1, 2, 3, 7, 8, reference_frame_id(0)])
+    tables.keyframes.insert(ids, random_poses(7, 5))
+    tables.landmarks.insert(np.arange(4), np.arange(12.0).reshape(4, 3))
+    pairs = [(0, 0), (1, 0), (1, 3), (3, 3), (2, 1), (3, 1), (7, 2), (8, 2)]
+    keyframes, landmarks = np.array(pairs).T
+    ones = np.ones((len(pairs), 3))
+    tables.observations.add(Observations(keyframes, landmarks, ones, ones))
+    before = GraphSnapshot.of(tables)
+    monkeypatch.setattr(adjustment_plot, "draw_before_after", lambda _, *found: views.extend(found))
+    none, stage = np.zeros((0, 2), np.int64), Stage("robust", 8, 5.0, 4.0, 1)
+    wrong = np.array([[0, 3], [0, 8]])
+    found = Adjustment((stage,), 2, wrong, 8, none, none[:, 0], 1.0)
+    draw_adjustment(tmp_path / "a.png", before, before, found)
+    for view in views:
+        assert len(view.points) == 4 and len(view.cloud) == 3
+        assert view.edges[0][0].tolist() == [[0, 1], [2, 3]]
+    assert views[0].edges[2][0].tolist() == [[0, 3]]
 
 
 def test_titles_are_inside_the_picture(tmp_path: Path) -> None:

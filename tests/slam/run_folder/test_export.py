@@ -1,5 +1,6 @@
 """``bmask-slam export``: each format is read back, and errors."""
 
+import shutil
 from pathlib import Path
 
 import gtsam
@@ -93,6 +94,15 @@ def test_the_graph_is_read_back(capsys, run: Path, tmp_path: Path) -> None:
     cloud = read_ply(tmp_path / "a.ply")
     np.testing.assert_allclose(np.stack([cloud[axis] for axis in "xyz"], axis=1), POINTS)
     assert cloud["id"].tolist() == [0, 1, 2]
+
+
+def test_a_graph_of_several_map_segments_says_so(capsys, run: Path, tmp_path: Path) -> None:
+    words = run, "--format", "g2o", "--out", tmp_path / "a.g2o"
+    assert export(*words) == 0
+    assert "a world of its own" not in capsys.readouterr().out
+    shutil.copy(run / "trajectory.txt", run / "trajectory_segment_1.txt")
+    assert export(*words) == 0
+    assert "\n1 more map segments are in it, each in a world of its own" in capsys.readouterr().out
 
 
 def test_points(run: Path, tmp_path: Path) -> None:
