@@ -115,10 +115,10 @@ def voxel_map(run: Path, resolution_m: float) -> tuple[VoxelMap, str]:
     Raises:
         InputError: no run, no dense map, or a broken one.
     """
-    depths = run / "dense" / "depth"
+    saved, depths = read_saved_map(run), run / "dense" / "depth"
     if not depths.is_dir():
         raise InputError(f"{depths}: no dense map here; make it with bmask-slam map {run}")
-    saved, cloud = read_saved_map(run), Run(run).dense_cloud
+    cloud = Run(run).dense_cloud
     T_map_world, frame = map_frame(saved, cloud)
     carver = VoxelCarver(resolution_m, T_map_world)
     carver.add_surface(cloud.points_world)

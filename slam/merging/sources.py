@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +33,8 @@ GAP_S = 10.0
 SLACK_S = 1e-4
 """Stamps in files have six decimals."""
 MAX_STAMP_S, MAX_INDEX = 1e11, 2**40
+MAX_SHARED = 0.5
+"""Of the keyframes of a run. Parts of one recording may overlap; more is the same run again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +119,8 @@ def read_sources(paths: Sequence[Path]) -> list[Source]:
     for path in paths:
         found.append(_read_source(path, found[-1] if found else None))
         _check_alike(found[0], found[-1])
+    for a, b in combinations(found, 2):
+        _check_apart(a, b)
     labelled = [source for source in found if len(source.labels[0]) > 1]
     for source in labelled[1:]:
         _check_labels(labelled[0], source)
@@ -170,6 +176,25 @@ def _check_alike(first: Source, other: Source) -> None:
             f"{other.path}: made with another camera ({theirs}) than {first.path} ({ours}); only "
             "runs of one camera can be merged"
         )
+
+
+def _check_apart(first: Source, other: Source) -> None:
+    """Refuse a run whose images are in the other one: what they show would count twice."""
+    ours, theirs = _seen_by(first.state), _seen_by(other.state)
+    same, fewest = len(ours & theirs), min(len(ours), len(theirs))
+    if same > MAX_SHARED * fewest:
+        raise InputError(
+            f"{other.path}: {same} keyframes are in {first.path} too, so what they show would "
+            "count twice; leave one of the two out (a run that continued another, a merged run "
+            "and the result of optimise have the whole map)"
+        )
+
+
+def _seen_by(state: Arrays) -> set[bytes]:
+    """What each keyframe with features has seen: the bytes of its descriptors."""
+    ends = np.cumsum(state["mapper.world.keyframes.keypoints"])[:-1]
+    rows = np.split(state["mapper.world.keypoints.descriptors"], ends)
+    return {hashlib.sha256(row.tobytes()).digest() for row in rows if len(row)}
 
 
 def _without_times(camera: Camera) -> Camera:

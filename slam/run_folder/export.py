@@ -89,7 +89,8 @@ def _check_paths(source: Path, files: tuple[Path, ...], times: Path | None) -> N
 
 def _graph(source: Path, out: Path) -> Exported:
     if not (source / "graph").is_file():
-        raise InputError(f"{source}: has no graph, which g2o needs; give a run folder")
+        cure = "give the folder of a finished run, not one with --localise"
+        raise InputError(f"{source}: has no graph, which g2o needs; {cure}")
     tables, camera = read_graph(source / "graph")
     write_landmark_graph(out, tables, camera)
     seen = tables.observations.select(tables.observations.all_rows())

@@ -31,8 +31,10 @@ SEMANTIC_FILES = (LABELS, OBJECTS, BOXES, OBJECTS_PICTURE)
 _COLUMNS = ("id", "label", "probability", "entropy", "views")
 _SURFACE_COLUMNS = ("surface", "surface_probability")
 _SHORTEST_UP = 1e-6
-_WITH_LABELS = "give a run that had a segmenter, not what `optimise` made of it"
-"""Its coordinates are written with so many decimals."""
+_WITH_LABELS = (
+    "give a run that had a segmenter, not what `optimise` made of it; after --localise the map's"
+)
+"""What to do where a run has no objects."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -282,6 +283,16 @@ def test_the_command_writes_an_octomap(
     occupied = np.array([key for key, is_occupied in voxels.items() if is_occupied])
     assert set(occupied[:, 2]) <= {-1, 0, 7}  # the floor and the table, seen from above
     assert min(key[2] for key, is_occupied in voxels.items() if not is_occupied) >= 0
+
+
+def test_a_run_without_a_map_is_not_sent_to_make_a_dense_one(run: Path) -> None:
+    out, options = run.parent / "a.yaml", DriveMapOptions()
+    shutil.rmtree(run / "dense")
+    with pytest.raises(InputError, match="no dense map here; make it with bmask-slam map"):
+        export_drive_map(run, "nav2", out, options)
+    (run / "map").unlink()
+    with pytest.raises(InputError, match="give a finished run, not one with --localise"):
+        export_drive_map(run, "nav2", out, options)
 
 
 def test_the_map_is_of_the_segment_that_the_trajectory_is_of(run: Path) -> None:

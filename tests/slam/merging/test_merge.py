@@ -161,6 +161,17 @@ def test_a_run_that_continued_another_is_merged(runs: Path, tmp_path: Path) -> N
     assert np.abs(se3_log(inverse(true) @ found)).max() < 0.01
 
 
+def test_a_run_that_is_in_the_other_one_is_refused(
+    runs: Path, merged: MergeSummary, tmp_path: Path
+) -> None:
+    """A copy, and a merged run beside one of those that it was made of."""
+    copy = shutil.copytree(runs / "first", tmp_path / "copy")
+    for other in (copy, merged.folder):
+        with pytest.raises(InputError, match=rf"{other}: \d+ keyframes are in .*first too, so"):
+            merge_runs(MergeOptions((runs / "first", other), tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_run_without_a_common_place_is_named(runs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(InputError, match=r"far: has no place in common with the other runs"):

@@ -129,6 +129,10 @@ def test_points(run: Path, tmp_path: Path) -> None:
             ["run/trajectory.txt", "--format", "g2o", "--out", "a"],
             "has no graph, which g2o needs",
         ),
+        (
+            ["run/trajectory.txt", "--format", "g2o", "--out", "a"],
+            "which g2o needs; give the folder of a finished run, not one with --localise",
+        ),
         (["a.g2o", "--format", "tum", "--out", "a"], "a graph has no stamps, which tum needs"),
         (["kitti.txt", "--format", "tum", "--out", "a"], "has no stamps; give them with --times"),
     ],
