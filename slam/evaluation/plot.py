@@ -96,12 +96,14 @@ def draw_top_view(
     plane = _view_plane_of(estimate, reference)
     if reference is not None:
         within = _same_time(reference, estimate)
-        axes.plot(*_path(within)[:, plane].T, color=REFERENCE, lw=2.2, label="reference", zorder=2)
+        shown = path_with_gaps(within)[:, plane].T
+        axes.plot(*shown, color=REFERENCE, lw=2.2, label="reference", zorder=2)
     if matched is not None:
         ends = np.stack([pose.positions_world[:, plane] for pose in matched], axis=1)
         axes.add_collection(LineCollection(list(ends), colors=DIFFERENCE, linewidths=0.5, zorder=1))
         axes.plot([], [], color=DIFFERENCE, lw=0.8, label=joined_by)
-    axes.plot(*_path(estimate)[:, plane].T, color=ESTIMATE, lw=1.1, label="estimate", zorder=3)
+    found = path_with_gaps(estimate)[:, plane].T
+    axes.plot(*found, color=ESTIMATE, lw=1.1, label="estimate", zorder=3)
     start = estimate.positions_world[:1, plane]
     axes.plot(*start.T, "o", color=ESTIMATE, ms=5, label="start", zorder=4)
     axes.set_aspect("equal", adjustable="datalim")
@@ -187,7 +189,7 @@ def _same_time(reference: Trajectory, estimate: Trajectory) -> Trajectory:
     return reference.select((stamps_s >= first_s - 1) & (stamps_s <= last_s + 1))
 
 
-def _path(trajectory: Trajectory) -> Array:
+def path_with_gaps(trajectory: Trajectory) -> Array:
     """Positions (M, 3) in metres with a row of NaN wherever the trajectory has a gap."""
     return _with_gaps(trajectory.timestamps_s, trajectory.positions_world)[:, 1:]
 

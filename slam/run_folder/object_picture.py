@@ -48,13 +48,16 @@ def draw_objects(
     """
     from matplotlib.figure import Figure  # noqa: PLC0415 - loads slowly
 
+    from bmask_slam.evaluation.plot import path_with_gaps  # noqa: PLC0415 - loads matplotlib
+
     R_upright_world = gravity_axes(found.up_world).T
     figure = Figure(figsize=SIZE_IN, dpi=130, layout="constrained")
     axes = figure.add_subplot()
     flat = (cloud.points_world @ R_upright_world.T)[:, :2]
     walked = (trajectory.positions_world @ R_upright_world.T)[:, :2]
+    line = (path_with_gaps(trajectory) @ R_upright_world.T)[:, :2]
     axes.scatter(flat[:, 0], flat[:, 1], s=2.2, c=LANDMARK_COLOUR, linewidths=0)
-    axes.plot(*walked.T, color=CAMERA_COLOUR, lw=1.2, label="camera", zorder=3)
+    axes.plot(*line.T, color=CAMERA_COLOUR, lw=1.2, label="camera", zorder=3)
     axes.plot(*walked[:1].T, "o", ms=5, color=CAMERA_COLOUR, zorder=3)
     ordered = sorted(found.objects, key=lambda o: -o.box.volume_m3)
     labels = sorted({o.label for o in ordered})
