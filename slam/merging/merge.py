@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import shlex
 import sys
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -178,10 +177,9 @@ def _plan(
 
 
 def _largest_segments(system: SlamSystem, sources: Sequence[Source]) -> list[int]:
-    """The largest map segment of each run."""
-    world = system.map.world
+    """The map segment of each run that its trajectory.txt is of."""
+    world, counts = system.map.world, system.map.history.frames(system.map.world)
     keyframes, mapped = list(world.keyframes.values()), world.mapped_segments()
-    counts = Counter(k.segment for k in keyframes)
     numbers = _run_of(sources, [k.id for k in keyframes])
     runs = {k.segment: number for k, number in zip(keyframes, numbers, strict=True)}
     return [

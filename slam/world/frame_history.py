@@ -93,17 +93,21 @@ class FrameHistory:
 
         Its frames are trajectory.txt. Without frames it is the one with most keyframes.
         """
+        frames, mapped = self.frames(world), world.mapped_segments()
+        if not frames:
+            return world.largest_segment()
+        return max(frames, key=lambda s: (s in mapped, frames[s], -s))
+
+    def frames(self, world: WorldMap) -> Counter[int]:
+        """The number of tracked frames whose keyframe was not lost, by map segment."""
         ids, counts = np.unique(self._store["keyframe_id"][: self._size], return_counts=True)
-        frames: Counter[int] = Counter()
+        found: Counter[int] = Counter()
         for keyframe_id, count in zip(ids.tolist(), counts.tolist(), strict=True):
             owner, _ = self.parent(keyframe_id)
             if owner != NO_KEYFRAME:
-                frames[world.keyframes[owner].segment] += count
+                found[world.keyframes[owner].segment] += count
         self._entries.release()
-        if not frames:
-            return world.largest_segment()
-        mapped = world.mapped_segments()
-        return max(frames, key=lambda s: (s in mapped, frames[s], -s))
+        return found
 
     def smooth(self, world: WorldMap) -> None:
         """Give the frames the poses that the camera's inertia makes the most probable."""

@@ -21,7 +21,9 @@ from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.merging import merge
 from bmask_slam.merging.joining import join_objects
+from bmask_slam.merging.joint_state import Shift
 from bmask_slam.merging.merge import MergeOptions, merge_runs
 from bmask_slam.merging.report import MergeSummary, format_merge
 from bmask_slam.run_folder import metrics
@@ -31,6 +33,8 @@ from bmask_slam.run_folder.reader import Run
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.keyframe_decision import KeyframeConfig
+from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.world_map import WorldMap
 
 PLACE = se3_exp(np.array([0.0, 0.0, 0.3, 0.2, 0.1, 0.0]))
 """The second walk's camera is turned about its axis and begins elsewhere."""
@@ -107,6 +111,19 @@ def test_objects_of_map_segments_that_are_not_joined_stay_apart() -> None:
     system: Any = SimpleNamespace(semantics=semantics, map=SimpleNamespace(world=world))
     assert join_objects(system, [0, 7]) == 2
     assert seen == [([0, 2], 7), ([1], 7)]
+
+
+def test_the_segment_of_a_run_that_is_joined_is_that_of_its_trajectory() -> None:
+    """It has most frames; another one has more keyframes. The second run has one segment."""
+    world, history = WorldMap(), FrameHistory()
+    for number, segment in enumerate((0, 0, 1, 2)):
+        keyframe: Any = SimpleNamespace(id=number, segment=segment, T_world_camera=np.eye(4))
+        world.keyframes[number] = keyframe
+    for k, keyframe_id in enumerate((0, 1, 2, 2, 2, 3)):
+        history.append(0.1 * k, keyframe_id, np.eye(4), np.eye(4))
+    system: Any = SimpleNamespace(map=SimpleNamespace(world=world, history=history))
+    sources: Any = [SimpleNamespace(shift=Shift(keyframes=first)) for first in (0, 3)]
+    assert merge._largest_segments(system, sources) == [1, 2]
 
 
 def test_the_result_is_one_run(merged: MergeSummary, runs: Path) -> None:
