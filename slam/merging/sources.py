@@ -131,7 +131,7 @@ def _read_source(path: Path, before: Source | None) -> Source:
     if not path.is_dir():
         raise InputError(f"{path}: no such folder; give the folder of a finished run")
     if not (path / MAP).is_file():
-        cure = "run the sequence again"
+        cure = "run the sequence again, without --localise"
         if (path / CHECKPOINT).is_file():
             cure = f"finish the run by: bmask-slam run --resume {path}"
         raise InputError(f"{path}: holds no map, so it is not a finished run; {cure}")

@@ -98,8 +98,7 @@ def write_film(
     film = _Film(options, run)
     film.shoot(progress)
     with whole_file(options.path) as temporary:
-        kind = options.path.suffix.lower()
-        write = _write_video if kind == ".mp4" else _write_animation
+        write = _write_video if options.path.suffix.lower() == ".mp4" else _write_animation
         write(temporary, list(film.pictures()), options)
     return options.path
 
@@ -155,7 +154,8 @@ class _Film:
                 self._shots.append(shot)
             progress(done, wanted)
         if len(self._shots) < MIN_SHOTS:
-            raise InputError(f"{self._run.path}: fewer than {MIN_SHOTS} frames to film")
+            few = f"{self._run.path} has poses of {len(self._shots)} of its frames, too few to film"
+            raise InputError(f"{self._sequence.folder}: {few}; give a longer run, its own images")
 
     def _shot(self, index: int, T_world_camera: Array) -> Shot:
         """A frame as an upright camera would have taken it."""

@@ -211,6 +211,7 @@ def test_what_cannot_be_merged_is_refused(
     for given, text in (
         ([other], "made with another camera (fx 500.0)"),
         ([unfinished], "holds no map, so it is not a finished run"),
+        ([unfinished], "run the sequence again, without --localise"),
         ([runs / "first"], "given twice"),
         ([], "give two runs or more"),
         ([tmp_path / "nothing"], "no such folder"),

@@ -170,3 +170,14 @@ def test_what_makes_no_film_is_refused(run: Path, tmp_path: Path) -> None:
         write_film(FilmOptions(run, tmp_path / "missing" / "film.gif"))
     with pytest.raises(InputError, match="no such list"):
         write_film(FilmOptions(run, sequence=tmp_path))
+
+
+def test_the_images_of_another_run_are_named(run: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(find_sequence(run), other)
+    for name in ("rgb.txt", "depth.txt"):
+        rows = [line.split() for line in (other / name).read_text().splitlines() if line[0] != "#"]
+        (other / name).write_text("".join(f"{float(t) + 500} {file}\n" for t, file in rows))
+    with pytest.raises(InputError, match=rf"{other}: {run} has poses of 0 of its frames"):
+        write_film(FilmOptions(run, tmp_path / "film.gif", sequence=other))
+    assert not (tmp_path / "film.gif").exists()
