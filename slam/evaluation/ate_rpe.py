@@ -148,12 +148,21 @@ def evaluate(
         estimate, body = _of_body(estimate, truth) if with_body else (estimate, [])
         result = evaluate_trajectory(estimate, truth, frames, with_scale)
         result.rows.extend(body)
+    _tell_segments(file)
     if plot is not None:
         from bmask_slam.evaluation.plot import plot_trajectory  # noqa: PLC0415 - matplotlib loads slowly
 
         events = [] if frames_s is None else clock.own_events(read_events(file.parent))
         plot_trajectory(plot, estimate, truth, run_or_trajectory.resolve().stem, events, with_scale)
     return result
+
+
+def _tell_segments(file: Path) -> None:
+    """Warn of a run's frames that are not compared, since no pose joins them to trajectory.txt."""
+    others = file.parent.glob("trajectory_segment_*.txt") if file.name == "trajectory.txt" else ()
+    if names := ", ".join(sorted(path.name for path in others)):
+        text = "%s: only the largest map segment is compared; %s beside it can be evaluated alone"
+        logger.warning(text, file, names)
 
 
 def _of_body(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, list[Row]]:

@@ -136,6 +136,21 @@ def test_run_folder_against_sequence_folder(tmp_path):
     assert direct.rows == result.rows
 
 
+def test_map_segments_that_are_not_compared_are_named(tmp_path, caplog):
+    write_tum(tmp_path / "groundtruth.txt", arc())
+    write_tum(tmp_path / "trajectory.txt", shaken(arc()))
+    evaluate(tmp_path, tmp_path)
+    assert not caplog.messages
+    for name in ("trajectory_segment_1.txt", "trajectory_segment_2.txt"):
+        write_tum(tmp_path / name, arc())
+    evaluate(tmp_path, tmp_path)
+    (told,) = caplog.messages
+    assert "only the largest map segment is compared; trajectory_segment_1.txt, traj" in told
+    caplog.clear()
+    evaluate(tmp_path / "trajectory_segment_1.txt", tmp_path)
+    assert not caplog.messages
+
+
 def test_the_picture_of_a_run_marks_its_events(tmp_path):
     write_tum(tmp_path / "groundtruth.txt", arc())
     write_tum(tmp_path / "trajectory.txt", shaken(arc()))
