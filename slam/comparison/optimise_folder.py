@@ -15,6 +15,7 @@ from bmask_slam.comparison.jobs.job import Job, Outcome, finished
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import plain_path, refuse_link
 from bmask_slam.graph.files.reading import read_bytes, read_text
+from bmask_slam.run_folder.folder import CHECKPOINT
 
 SUFFIXES = (".g2o", ".graph")
 JOBS, GRAPH = "jobs", "graph"
@@ -102,8 +103,8 @@ def _is_input(path: Path) -> bool:
 
 
 def is_run_folder(path: Path) -> bool:
-    """Whether a folder is one that ``bmask-slam run`` has written."""
-    return (path / "metrics.json").is_file() or (path / GRAPH).exists()
+    """Whether a folder is one that ``bmask-slam run`` has written, or began to."""
+    return any((path / name).exists() for name in ("metrics.json", GRAPH, CHECKPOINT))
 
 
 def _job(path: Path, out: Path, more: tuple[str, ...]) -> Job:

@@ -25,6 +25,7 @@ from bmask_slam.graph.trajectory_formats import (
 )
 from bmask_slam.run_folder.folder import trajectory_files
 from bmask_slam.run_folder.landmark_file import LANDMARKS_COMMENT
+from bmask_slam.run_folder.map_file import check_finished
 from bmask_slam.run_folder.scene.scene_graph import write_object_points, write_scene_graph
 
 ExportFormat = Literal["tum", "kitti", "euroc", "g2o", "ply", "scene-graph", "objects-ply"]
@@ -88,6 +89,7 @@ def _check_paths(source: Path, files: tuple[Path, ...], times: Path | None) -> N
 
 
 def _graph(source: Path, out: Path) -> Exported:
+    check_finished(source)
     if not (source / "graph").is_file():
         cure = "give the folder of a finished run, not one with --localise"
         raise InputError(f"{source}: has no graph, which g2o needs; {cure}")
@@ -131,6 +133,7 @@ def _ids(ids: Ints) -> NDArray[np.int32]:
 
 
 def _landmarks(source: Path, out: Path) -> Exported:
+    check_finished(source)
     columns = read_ply(source / "landmarks.ply")
     write_ply(out, columns, LANDMARKS_COMMENT)
     count = len(next(iter(columns.values())))

@@ -24,7 +24,7 @@ from bmask_slam.graph.files.ply import POINTS, read_ply
 from bmask_slam.graph.marginals.landmark_marginalisation import reinsert
 from bmask_slam.graph.smoother.storage import read_camera, read_graph
 from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, Trajectory, read_tum
-from bmask_slam.run_folder.folder import trajectory_files
+from bmask_slam.run_folder.folder import CHECKPOINT, trajectory_files
 from bmask_slam.run_folder.frame_file import FRAMES, read_frames
 from bmask_slam.run_folder.origin import CONFIG
 from bmask_slam.semantics.beliefs.label_store import LabelStore
@@ -50,11 +50,19 @@ def read_map(path: Path) -> tuple[Arrays, Camera]:
     Raises:
         InputError: it is missing, foreign, broken, empty or of another version.
     """
+    check_finished(path)
     file = path / MAP if path.is_dir() else path
     header, state = read_arrays(file, MAP_FILE)
     if not len(state.get("mapper.world.keyframes.id", ())):
         raise InputError(f"{file}: holds no keyframe; give the map of a run that saw something")
     return state, read_camera(header, file)
+
+
+def check_finished(run: Path) -> None:
+    """Raises InputError for the folder of a run that was killed and can go on, so has no map."""
+    if (run / CHECKPOINT).is_file() and not (run / MAP).is_file():
+        cure = f"finish the run by: bmask-slam run --resume {run}"
+        raise InputError(f"{run}: is not finished, and has no map yet; {cure}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +97,7 @@ def read_run(path: Path) -> SavedRun:
     Raises:
         InputError: a file that is missing or broken, or keyframes.txt and graph of different runs.
     """
+    check_finished(path)
     if not (path / "graph").is_file():
         cure = "give the folder of a run that came to its end, without --localise"
         raise InputError(f"{path}: holds no graph; {cure}")
