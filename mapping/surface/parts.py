@@ -10,6 +10,7 @@ import torch
 from bmask_slam.graph.arrays import Bytes, Floats, Ints
 from bmask_slam.mapping.surface.blocks import EDGE, block_indices, block_keys
 from bmask_slam.mapping.surface.extraction import (
+    CORNERS,
     MIN_WITNESSES,
     SortedBlocks,
     Surface,
@@ -45,11 +46,12 @@ class SurfacePart:
 def regions_of(keys: Ints) -> set[Region]:
     """The regions whose parts change with blocks that have these keys (B,).
 
-    A block at the border of a region also gives the next one its vertices there.
+    A block at the border of a region also gives the next ones their vertices there: two at a face,
+    four at an edge, eight at a corner.
     """
     index = block_indices(torch.from_numpy(keys)).numpy()
-    around = np.concatenate([index - 1, index, index + 1]) // BLOCKS
-    return {(x, y, z) for x, y, z in np.unique(around, axis=0).tolist()}
+    around = (index[:, None] + (2 * CORNERS - 1)) // BLOCKS
+    return {(x, y, z) for x, y, z in np.unique(around.reshape(-1, 3), axis=0).tolist()}
 
 
 def extract_region(

@@ -13,6 +13,7 @@ from surface_scene import CAMERA, as_map, plane_rho, poses
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.files.array_file import write_arrays
 from bmask_slam.graph.geometry import make_pose
+from bmask_slam.mapping.surface.blocks import block_keys
 from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame
 from bmask_slam.mapping.surface.extraction import Surface, extract
 from bmask_slam.mapping.surface.following import (
@@ -21,7 +22,7 @@ from bmask_slam.mapping.surface.following import (
     displacement_m,
     read_kept,
 )
-from bmask_slam.mapping.surface.parts import as_part, extract_region, regions_of
+from bmask_slam.mapping.surface.parts import BLOCKS, as_part, extract_region, regions_of
 from bmask_slam.mapping.surface.volume import SurfaceVolume
 
 VOXEL_M, WALL_M, ERROR_M = 0.05, 2.0, 0.1
@@ -98,6 +99,18 @@ def test_parts_of_all_regions_are_the_whole_surface() -> None:
     one, other = (c.reshape(len(c), -1) for c in (corners, corners_of(whole)))
     one, other = (c[np.lexsort(c.T)] for c in (one, other))
     np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("block", "count"), [((3, 3, 3), 1), ((7, 3, 3), 2), ((0, 3, -8), 4), ((-1, 8, 15), 8)]
+)
+def test_a_block_changes_every_region_that_it_is_beside(
+    block: tuple[int, int, int], count: int
+) -> None:
+    found = regions_of(block_keys(torch.tensor([block])).numpy())
+    low = BLOCKS * np.array(sorted(found))
+    assert len(found) == count
+    assert ((low - 1 <= block) & (block <= low + BLOCKS)).all()
 
 
 def corners_of(surface: Surface) -> Array:
