@@ -249,17 +249,20 @@ def tracked_frames(run: MappedRun) -> list[tuple[int, Array]]:
     trajectory, stamps_s = read_tum(path), run.sequence.timestamps_s
     nearest = nearest_indices(stamps_s, trajectory.timestamps_s)
     same = np.abs(stamps_s[nearest] - trajectory.timestamps_s) <= MAX_STAMP_ERROR_S
-    same &= ~np.isin(nearest, _reckoned(run.path / FRAMES))
+    same &= ~np.isin(trajectory.timestamps_s, _reckoned_s(run.path / FRAMES))
     poses = trajectory.poses_world_camera
     return [(int(nearest[k]), poses[k]) for k in np.flatnonzero(same).tolist()]
 
 
-def _reckoned(path: Path) -> Ints:
-    """Indices of the frames whose poses are by odometry alone."""
+def _reckoned_s(path: Path) -> Array:
+    """Stamps of the frames whose poses are by odometry alone, as trajectory.txt has them.
+
+    Their indices do not serve: a live run counts the frames that it tracked.
+    """
     if not path.is_file():
-        return np.zeros(0, np.int64)
+        return np.zeros(0)
     frames = read_frames(path)
-    return frames.index[np.array(frames.status) == TrackingStatus.DEAD_RECKONING.value]
+    return frames.timestamps_s[np.array(frames.status) == TrackingStatus.DEAD_RECKONING.value]
 
 
 def frames_a_keyframe(fused: FusedMap) -> float:
