@@ -144,15 +144,14 @@ class DenseMapper:
         return _Prepared(keyframe, regularise(measured), image)
 
     def _matched(self, keyframe: DenseKeyframe, image: Tensor) -> InverseDepthMap:
-        """Steps 1 and 2 with the right image, or else with the last keyframes apart from it."""
+        """Steps 1 and 2 with the right image, or else with the last keyframes before it apart."""
         window = search_range(keyframe.landmark_depths_m)
         if window is not None and keyframe.right is not None:
             right = as_image(keyframe.right, self.config.device)
             return match_stereo(image, right, self.camera, window)
         T_own_world = inverse(keyframe.T_world_camera)
-        others = [
-            (p.image, T_own_world @ p.keyframe.T_world_camera) for p in self._prepared[-WINDOW:]
-        ]
+        before = [p for p in self._prepared if p.keyframe.id < keyframe.id]
+        others = [(p.image, T_own_world @ p.keyframe.T_world_camera) for p in before[-WINDOW:]]
         apart = [o for o in others if np.linalg.norm(o[1][:3, 3]) > MIN_BASELINE_M]
         if window is None or not apart or self.config.source == "stereo":
             empty = torch.full(image.shape[-2:], torch.nan, device=image.device)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from surface_scene import CAMERA, noisy_map, poses
 
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.geometry import make_pose, se3_exp
 from bmask_slam.mapping.inverse_depth.dense_mapper import (
     WINDOW,
+    DenseConfig,
     DenseKeyframe,
     DenseMapper,
     FusedKeyframe,
@@ -18,6 +20,7 @@ from bmask_slam.mapping.inverse_depth.dense_mapper import (
 )
 
 RGB = np.full((30, 40, 3), 100, np.uint8)
+WALL_M = 0.5
 
 
 def keyframes(count: int) -> list[DenseKeyframe]:
@@ -125,3 +128,29 @@ def test_late_labels_have_the_effect_of_early_ones() -> None:
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_array_equal(a.map.rho.numpy(), b.map.rho.numpy())
     assert found[3].keyframe.instances is numbers
+
+
+def swept_keyframes(count: int) -> list[DenseKeyframe]:
+    """Keyframes without depth that move along a textured wall, two pixels to the right each."""
+    rough = np.random.default_rng(5).uniform(0, 255, (30, 40 + 2 * count, 3))
+    wall = cv2.GaussianBlur(rough, (0, 0), 1.2).astype(np.uint8)
+    found = []
+    for k in range(count):
+        T = make_pose(np.eye(3), np.array([2 * k * WALL_M / CAMERA.fx, 0, 0]))
+        rgb, none = wall[:, 2 * k : 2 * k + 40].copy(), np.full((30, 40), np.nan, np.float32)
+        depths_m = WALL_M * np.linspace(0.7, 1.4, 10)
+        found.append(DenseKeyframe(k, T, rgb, none, np.arange(10), depths_m))
+    return found
+
+
+def test_late_labels_do_not_change_with_what_a_keyframe_is_matched() -> None:
+    """Of the keyframes that came since, the last ones see the least of what it sees."""
+    given, config = swept_keyframes(9), DenseConfig(source="motion")
+    expected = all_of(DenseMapper(CAMERA, config), given)
+    mapper = DenseMapper(CAMERA, config)
+    found = [r for k in given[:6] for r in mapper.add(k)]
+    mapper.relabel(1, np.zeros((30, 40), np.uint16), np.zeros((30, 40), bool))
+    found += [r for k in given[6:] for r in mapper.add(k)] + mapper.flush()
+    assert expected[1].map.known.float().mean() > 0.3
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(a.map.rho.numpy(), b.map.rho.numpy())
