@@ -175,7 +175,9 @@ class FloorPlan:
         mask = np.pad((grid == wall).astype(np.uint8), length)  # nothing is beyond the border
         inside = (slice(length, -length),) * 2
         for size in ((1, length), (length, 1)):
-            closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones(size, np.uint8))
+            kernel = np.ones(size, np.uint8)
+            grown = cv2.dilate(mask, kernel, anchor=(0, 0))  # MORPH_CLOSE shifts by even lengths
+            closed = cv2.erode(grown, kernel, anchor=(size[1] - 1, size[0] - 1))
             grid[(closed[inside] > 0) & (grid < 0)] = wall
 
     def picture(self, path_world: Array) -> Image:

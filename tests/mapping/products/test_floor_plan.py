@@ -153,6 +153,24 @@ def test_walls_are_those_of_the_labels_and_their_gaps_are_closed() -> None:
     assert (grid[row[0]] == 2)[: round(2.95 / 0.05)].all()
 
 
+@pytest.mark.parametrize("cell_m", [0.05, 0.06])
+def test_closing_gaps_of_any_number_of_cells_leaves_a_wall_as_thick_as_it_is(cell_m: float) -> None:
+    """Two walls of one cell, each with a gap of 0.2 m, that cross."""
+    along = np.arange(0.5, 20) * cell_m
+    along = along[(along < 0.4) | (along > 0.6)]
+    wide = np.full(len(along), 15.5 * cell_m)
+    xy = np.concatenate([np.column_stack([along, wide]), np.column_stack([wide, along])])
+    points = np.column_stack([xy, np.ones(len(xy))]).astype(np.float32)
+    ones = np.ones(len(points), np.float32)
+    labels, colours = ones.astype(np.uint16), np.zeros((len(points), 3), np.uint8)
+    plan = FloorPlan(PlanFrame(np.eye(3), 0.0, cell_m), ("background", "wall"))
+    plan.add(Cloud(points, points, colours, ones, labels, ones, labels))
+    grid, _ = plan.grid(np.zeros((1, 3)))
+    expected = np.full((20, 20), -2)
+    expected[20 - 1 - 15], expected[:, 15] = 1, 1
+    np.testing.assert_array_equal(grid, expected)
+
+
 def test_a_plan_takes_memory_for_what_stands_there_not_for_all_cells_and_classes() -> None:
     """Two walls, 20 m apart, and ninety classes."""
     points = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (1000, 1))
