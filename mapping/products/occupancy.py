@@ -19,6 +19,8 @@ MAX_RANGE_M = 5.0
 """Of rays that carve free space; farther depth is too uncertain."""
 MARGIN_VOXELS = 2
 """A ray ends so many voxels before the surface."""
+UNITED = 1 << 22
+"""So many voxels of the last rays, and no more than of all before, are kept apart from these."""
 MAX_STRIDE_PX = 8
 FLOOR_M = 0.1
 """Surfaces so near to the height 0 are floor."""
@@ -70,8 +72,8 @@ class VoxelCarver:
         Pixels are taken so that their rays are a voxel apart at MAX_RANGE_M. The rays of moving
         things count too: what lies before them is free.
         """
-        nearest_m = self._resolution_m * camera.fx / MAX_RANGE_M
-        stride = int(np.clip(nearest_m, 1, MAX_STRIDE_PX))
+        apart_px = self._resolution_m * camera.fx / MAX_RANGE_M
+        stride = int(np.clip(apart_px, 1, MAX_STRIDE_PX))
         rows, columns = np.mgrid[0 : camera.height : stride, 0 : camera.width : stride]
         z_m = depth_m[::stride, ::stride].ravel().astype(float)
         seen = np.isfinite(z_m) & (z_m > 0)
@@ -102,6 +104,8 @@ class VoxelCarver:
             active = int(np.searchsorted(-reach, -step))
             found.append(np.unique(_packed(np.floor(begin + step * directions[:active]))))
         self._free.append(np.unique(np.concatenate(found)))
+        if sum(map(len, self._free[1:])) > max(len(self._free[0]), UNITED):
+            self._free = [np.unique(np.concatenate(self._free))]
 
     def voxels(self) -> VoxelMap:
         """Everything that is known.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from drive_map_files import load_nav2, load_octomap
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, transform
+from bmask_slam.mapping.products import occupancy
 from bmask_slam.mapping.products.occupancy import (
     FREE,
     OCCUPIED,
@@ -110,6 +112,23 @@ def test_octomaps_own_library_writes_the_same_file(carved: VoxelMap, tmp_path: P
         assert (read.size(), read.getResolution()) == (nodes, voxels.resolution_m)
         states = [read.isNodeOccupied(read.search(place)) for place in places]
         assert np.array_equal(states, voxels.occupied)
+
+
+def test_what_is_seen_again_takes_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(occupancy, "UNITED", 1000)
+    T = make_pose(LOOKS_ALONG_X, np.array([0.05, 0.05, 1.05]))
+    carver, once, held = VoxelCarver(R, np.eye(4)), VoxelCarver(R, np.eye(4)), []
+    depth_m = np.full((48, 64), 4.0, np.float32)
+    once.carve(depth_m, CAMERA, T)
+    tracemalloc.start()
+    try:
+        for _ in range(100):
+            carver.carve(depth_m, CAMERA, T)
+            held.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+    assert max(held) < 4 * held[0]
+    np.testing.assert_array_equal(carver.voxels().keys, once.voxels().keys)
 
 
 def test_a_map_without_anything_is_refused() -> None:
