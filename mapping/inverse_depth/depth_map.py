@@ -17,7 +17,7 @@ from bmask_slam.graph.files.array_file import FileKind, check_like, read_arrays,
 from bmask_slam.mapping.inverse_depth.pixelwise import nan_where_negative, squared_gradient
 
 DEPTH_FILE = FileKind("fused depth", 1, compressed=True)
-RHO_STEP, SIGMA_STEP = 1 / 16000, 1e-6
+RHO_STEP, SIGMA_STEP, MAX_STEPS = 1 / 16000, 1e-6, 65535
 """Units of the stored integers in 1/m: rho up to 4, far finer than sigma, and sigma up to 0.065."""
 
 
@@ -101,9 +101,12 @@ def from_sensor(
 def write_depth_map(path: Path, given: InverseDepthMap) -> None:
     """Save a map, quantised; the file appears whole or not at all.
 
+    What is nearer than 0.25 m, which the file cannot hold, is unknown in it.
+
     Raises:
         InputError: it cannot be written.
     """
+    given = given.where(given.rho < MAX_STEPS * RHO_STEP)
     arrays = {
         "rho": _quantised(given.rho, RHO_STEP),
         "sigma": _quantised(torch.sqrt(given.variance), SIGMA_STEP),
@@ -128,5 +131,5 @@ def read_depth_map(path: Path) -> InverseDepthMap:
 
 def _quantised(values: Tensor, step: float) -> NDArray[np.uint16]:
     """Multiples of a step, at least 1, 0 where NaN."""
-    steps = torch.nan_to_num(torch.round(values / step).clamp(1, 65535))
+    steps = torch.nan_to_num(torch.round(values / step).clamp(1, MAX_STEPS))
     return np.asarray(steps.cpu().numpy(), np.uint16)
