@@ -33,7 +33,9 @@ from bmask_slam.viewer.shown import (
 if TYPE_CHECKING:  # it loads torch
     from bmask_slam.mapping.surface.parts import SurfacePart
 
-PATH_EVERY = 10
+PATH_EVERY, MAX_PATH = 10, 2000
+"""How often the path is shown, in frames, and its most points: a longer one is thinned, since what
+was shown before stays in the recording."""
 PATH_COLOUR = (80, 170, 255)
 STATUS = dict.fromkeys(TrackingStatus, 1) | {TrackingStatus.OK: 2, TrackingStatus.LOST: 0}
 BAD = (EventKind.LOST, EventKind.GRAPH)
@@ -60,6 +62,7 @@ class Scene:
                 self.close()
                 raise
         self._path: list[Array] = []
+        self._path_frames, self._path_step = 0, 1
 
     @property
     def url(self) -> str:
@@ -74,6 +77,7 @@ class Scene:
     def log_camera(self, camera: Camera) -> None:
         """Show the camera's field of view; the path begins anew."""
         self._path.clear()
+        self._path_frames, self._path_step = 0, 1
         size = -(-camera.width // IMAGE_STEP), -(-camera.height // IMAGE_STEP)
         K = np.diag([1 / IMAGE_STEP, 1 / IMAGE_STEP, 1.0]) @ camera.K
         for each in self._transports:
@@ -91,9 +95,7 @@ class Scene:
         if T is not None:
             for each in self._transports:
                 each.pose("world/camera", T)
-            self._path.append(T[:3, 3])
-            if len(self._path) % PATH_EVERY == 0:
-                self.log_line("world/trajectory", np.array(self._path), PATH_COLOUR)
+            self._extend_path(T[:3, 3].copy())
         if rgb is not None:
             self.log_image(as_jpeg(rgb))
         self.log_numbers("status", {"status": STATUS[result.status]})
@@ -107,6 +109,16 @@ class Scene:
                 each.ellipsoids("world/camera/uncertainty", [here])
         for event in result.events:
             self.log_event(event)
+
+    def _extend_path(self, position: Array) -> None:
+        """Add a position (3,) to the path, and show it now and then."""
+        if self._path_frames % self._path_step == 0:
+            self._path.append(position)
+        self._path_frames += 1
+        if len(self._path) > MAX_PATH:
+            self._path, self._path_step = self._path[::2], 2 * self._path_step
+        if self._path_frames % PATH_EVERY == 0:
+            self.log_line("world/trajectory", np.array(self._path), PATH_COLOUR)
 
     def log_image(self, jpeg: bytes) -> None:
         """Show what the camera sees, as ``as_jpeg`` makes it."""
