@@ -161,7 +161,7 @@ class FreeSpaceCheck:
 
         Args:
             pixels: (N, 2) of the keypoints.
-            depth_m: (N,) NaN where missing; such keypoints keep their motion.
+            depth_m: (N,) NaN where missing; such keypoints follow neighbours of any depth.
             point_motions: (N,).
         """
         is_known = point_motions != PointMotion.UNKNOWN
