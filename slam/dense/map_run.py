@@ -173,10 +173,14 @@ class RunFusion:
         return counts
 
     def _needed(self) -> Mask:
-        """Which keyframes (K,) must be read: the unfinished ones and those in their windows."""
+        """Which keyframes (K,) must be read: the unfinished ones and those in their windows.
+
+        Where depth may come from a sweep, also those with which the latter are matched.
+        """
         unfinished = np.array([not self.folder.is_done(k.id) for k in self.run.keyframes], bool)
-        near = np.convolve(unfinished, np.ones(2 * WINDOW + 1))[WINDOW : WINDOW + len(unfinished)]
-        return np.asarray(near > 0.5)
+        before = 2 * WINDOW if self.options.source in ("both", "motion") else WINDOW
+        near = np.convolve(unfinished, np.ones(before + WINDOW + 1))[before:]
+        return np.asarray(near[: len(unfinished)] > 0.5)
 
 
 def open_fusion(options: MapOptions) -> RunFusion:
