@@ -20,6 +20,9 @@ from bmask_slam.mapping.surface.pixel_planes import (
 
 HALF_MAX = np.float32(6e4)
 """Weights of colours are cut off here, below the largest float16."""
+MANY, HALF = np.float32(2048), np.float32(0.5)
+"""So many frames are counted: of more a float16 cannot tell one. Then both counts are halved, so
+that what comes after counts more."""
 NEAREST_M = 0.1
 Places = tuple[Floats, Floats]
 """(N, 3) the first voxels of bricks in the camera, and (V, 3) a brick's voxels from there, m."""
@@ -65,6 +68,17 @@ def blended(bits: np.uint16, colour: float, share: float) -> np.uint16:
 
 
 @compiled
+def count_more(counts: Array, others: Array, at: tuple[int, int], more: float) -> None:
+    """Add to a voxel's count, as the bits of a float16; ``others`` is compared with it."""
+    b, k = at
+    total = half_value(counts[b, k]) + more
+    if total > MANY:
+        total *= HALF
+        others[b, k] = half_bits(half_value(others[b, k]) * HALF)
+    counts[b, k] = half_bits(total)
+
+
+@compiled
 def pixel_at(x: float, y: float, z: float, view: View) -> int:
     """Index of the pixel on which a point of the camera falls; -1 outside the image."""
     fx, fy, cx, cy, width, height = view
@@ -93,7 +107,7 @@ def add_to_brick(
         if p < 0:
             continue
         if z < free_m[p] * kept - front:
-            free[b, k] = half_bits(half_value(free[b, k]) + ONE)
+            count_more(free, witnesses, (b, k), ONE)
         behind, w = pixels[p, BEHIND], pixels[p, WEIGHT]
         d = pixels[p, NX] * x + pixels[p, NY] * y + pixels[p, NZ] * z - pixels[p, OFFSET]
         if w <= 0 or d <= -behind or z >= pixels[p, Z] + behind + behind:
@@ -104,7 +118,7 @@ def add_to_brick(
         weight[b, k] = total
         distance[b, k] += added / total * (d - distance[b, k])
         if abs(d) < near:  # written out, which is a third faster than a loop over the colours
-            witnesses[b, k] = half_bits(half_value(witnesses[b, k]) + pixels[p, WITNESS])
+            count_more(witnesses, free, (b, k), pixels[p, WITNESS])
             added = w * paint[p, 3]
             total = half_value(colour[b, k, 3]) + added
             share = added / total

@@ -52,7 +52,8 @@ class SurfaceVolume:
         voxel_m: edge of a voxel.
         distance: (8 B, 64) float32, metres, positive in front of the surface.
         weight: (8 B, 64) float32, sum of 1 / sigma^2 in 1/cm^2; 0 where unknown.
-        witnesses, free: (8 B, 64) float16, frames that saw a surface at the voxel, and through it.
+        witnesses, free: (8 B, 64) float16, frames that saw a surface at the voxel, and through it;
+            both are halved where one is more than 2048.
         colour: (8 B, 64, 4) float16, 0 to 255, and the sum of its weights.
     """
 

@@ -95,6 +95,33 @@ def test_a_volume_holds_what_the_rules_give(order: tuple[int, ...]) -> None:
     assert (volume.witnesses.numpy()[:count][seen] > 0).mean() > 0.9
 
 
+@pytest.mark.parametrize(("counted", "other"), [("witnesses", "free"), ("free", "witnesses")])
+def test_shares_hold_however_many_frames_are_counted(counted: str, other: str) -> None:
+    """A camera that stands for minutes: a float16 counts to 2048."""
+    volume = SurfaceVolume(VOXEL_M, CAMERA)
+    near, far = (
+        depth_frame(
+            as_map(np.full((30, 40), 1 / z_m), 0.002),
+            np.full((30, 40, 3), 99, np.uint8),
+            np.eye(4),
+            CAMERA,
+            VOXEL_M,
+        )
+        for z_m in (2.0, 3.0)
+    )
+    volume.integrate(near)
+    at = volume.witnesses == 1
+    often, seldom = (near, far) if counted == "witnesses" else (far, near)
+    getattr(volume, counted)[at], getattr(volume, other)[at] = 2040, 408
+    for _ in range(40):
+        for frame in (*[often] * 5, seldom):
+            volume.integrate(frame)
+    counts, others = (getattr(volume, name)[at].float() for name in (counted, other))
+    both = others > 210
+    assert both.float().mean() > 0.5
+    np.testing.assert_allclose((others / counts)[both], 0.2, rtol=0.01)
+
+
 def test_where_nothing_can_be_kept_it_is_compiled_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*, cache: bool = False, nogil: bool, error_model: str) -> object:
         if cache:
