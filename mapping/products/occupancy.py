@@ -177,14 +177,14 @@ def grid_of(voxels: VoxelMap, low_m: float, high_m: float) -> OccupancyGrid:
     width, height = np.array([column.max(), row.max()]) - low + 1
     cells = np.full((height, width), UNKNOWN, np.int8)
     place = row - low[1], column - low[0]
-    bottom_m = layer * r
-    floor = voxels.occupied & (np.abs(bottom_m + r / 2) <= max(FLOOR_M, r))
-    floor &= bottom_m + r / 2 < low_m
-    band = (bottom_m + r / 2 > low_m) & (bottom_m + r / 2 < high_m)
-    lowest = band & (bottom_m + r / 2 < low_m + LOWEST_M) & ~voxels.occupied
+    top_m = min(low_m + LOWEST_M, high_m)
+    height_m, heights_m = (layer + 0.5) * r, (np.arange(top_m / r) + 0.5) * r
+    floor = voxels.occupied & (np.abs(height_m) <= max(FLOOR_M, r)) & (height_m < low_m)
+    band = (height_m > low_m) & (height_m < high_m)
+    lowest = band & (height_m < top_m) & ~voxels.occupied
     counts = np.zeros_like(cells, np.int32)
     np.add.at(counts, tuple(p[lowest] for p in place), 1)
-    layers = max(int(min(LOWEST_M, high_m - low_m) / r), 1)
+    layers = np.count_nonzero((heights_m > low_m) & (heights_m < top_m))
     cells[counts >= max(layers / 2, 1)] = FREE
     cells[tuple(p[floor] for p in place)] = FREE
     cells[tuple(p[band & voxels.occupied] for p in place)] = OCCUPIED

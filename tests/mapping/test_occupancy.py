@@ -70,6 +70,23 @@ def test_a_grid_is_free_where_the_floor_or_the_space_above_it_was_seen(carved: V
     assert grid_of(carved, 2.5, 3.0).cells[row, column + 20] == FREE  # not so high
 
 
+@pytest.mark.parametrize(
+    ("resolution_m", "heights_m", "layers"),
+    [(0.1, (0.2, 0.5), 3), (0.05, (0.1, 1.5), 10), (0.03, (0.1, 1.5), 17)],
+)
+def test_half_of_the_lowest_layers_must_be_free(
+    resolution_m: float, heights_m: tuple[float, float], layers: int
+) -> None:
+    """Their middles are above the low, and below the high and half a metre above the low."""
+    middles_m = (np.arange(60) + 0.5) * resolution_m
+    bottom = int(np.flatnonzero(middles_m > heights_m[0])[0])
+    enough = -(-layers // 2)
+    for free, state in ((enough, FREE), (enough - 1, UNKNOWN)):
+        keys = np.array([[0, 0, bottom + k] for k in range(free)] + [[1, 0, 59]])
+        voxels = VoxelMap(resolution_m, np.eye(4), keys, np.zeros(len(keys), bool))
+        assert grid_of(voxels, *heights_m).cells[0, 0] == state
+
+
 def test_nav2_reads_the_grid_back(tmp_path: Path) -> None:
     cells = np.array([[FREE, OCCUPIED, UNKNOWN], [UNKNOWN, FREE, FREE]], np.int8)
     grid = OccupancyGrid(0.05, np.array([-1.5, 2.25]), cells)
