@@ -115,7 +115,7 @@ class _SurfaceMaker:
         surface, voxel_m = self._surface, self._fused.options.surface_voxel_m
         poses = {n: k.T_world_camera for n, k in self._keyframes.items()} | frames
         alone = FollowingSurface(self._volume(), self._load) if len(surface) else surface
-        for number in self._keyframes:
+        for number in self._keyframes if frames or alone is surface else ():
             alone.add(number, self._keyframe(number, poses[number]))
         if frames:
             seen = without_crumbs(extract(alone.volume, 1), voxel_m, MIN_JUDGE_M2)

@@ -14,10 +14,12 @@ import pytest
 from true_run import make_run
 
 from bmask_slam.cli import main
+from bmask_slam.dense import surface
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.map_run import RunFusion
 from bmask_slam.dense.options import MapOptions
 from bmask_slam.dense.saved_map import open_run
+from bmask_slam.dense.surface import keyframe_as_frame as as_frame
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -129,6 +131,19 @@ def test_the_baseline_is_read_from_the_sequences_camera_file(
     assert np.nanmedian((1 + relative_errors(run, sequence)) / once) == pytest.approx(1.1, abs=0.01)
     assert mapped(run, "sensor") == 0
     assert "2 fused, 0 were finished" in capsys.readouterr().out
+
+
+def test_a_kept_volume_of_keyframes_alone_is_not_made_again(
+    sequence: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, made = run_of(sequence, (0, 1)), list[object]()
+    monkeypatch.setattr(surface, "keyframe_as_frame", lambda *k: made.append(k) or as_frame(*k))
+    clouds = []
+    for _ in range(2):
+        assert mapped(run, "stereo", "--keep-volume", "--quiet") == 0
+        clouds.append((run / "dense" / "cloud.ply").read_bytes())
+    assert len(made) == 2
+    assert clouds[0] == clouds[1]
 
 
 def test_both_uses_the_pair_where_the_sensor_has_no_depth(sequence: Path) -> None:
