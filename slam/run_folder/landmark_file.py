@@ -131,9 +131,12 @@ class DenseCloud:
 def read_dense_cloud(path: Path, names: tuple[str, ...]) -> DenseCloud:
     """Read a cloud of a dense folder, whose labels have these names. Raises InputError."""
     columns = _columns(path, ("nx", "ny", "nz", "label", "probability", "sigma"))
+    normals = np.stack([columns[f"n{axis}"] for axis in "xyz"], axis=1).astype(float)
+    if not (np.isfinite(columns["xyz"]).all() and np.isfinite(normals).all()):
+        raise InputError(f"{path}: a point or normal is not finite; make it again")
     return DenseCloud(
         columns["xyz"],
-        np.stack([columns[f"n{axis}"] for axis in "xyz"], axis=1).astype(float),
+        normals,
         columns["rgb"],
         _named(columns["label"], names, path),
         columns["probability"].astype(float),

@@ -215,7 +215,8 @@ class Run:
         """The dense cloud of each object by its id, after ``map_run``."""
         names = self._dense_names
         files = sorted((self.path / DENSE / "objects").glob("*-*.ply"))
-        return {int(f.name.partition("-")[0]): read_dense_cloud(f, names) for f in files}
+        own = ((f.name.partition("-")[0], f) for f in files)
+        return {int(k): read_dense_cloud(f, names) for k, f in own if k.isdecimal()}
 
     @cached_property
     def metrics(self) -> dict[str, Metric]:
