@@ -42,11 +42,12 @@ def close_holes(surface: Surface, most_m: float = MAX_BORDER_M) -> Surface:
     middle = sums(surface.vertices[border[:, 0]]) / length
     first, second = (surface.vertices[border[:, k]] - middle[hole] for k in (1, 0))
     normals = sums(np.cross(first, second))
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)  # 0 of no area
     weights = np.full(len(which), np.inf, np.float32)
     np.minimum.at(weights, hole, surface.weights[border[:, 0]])
     return Surface(
         _extended(surface.vertices, middle),
-        _extended(surface.normals, normals / np.linalg.norm(normals, axis=1, keepdims=True)),
+        _extended(surface.normals, normals),
         _extended(surface.colours, np.rint(sums(surface.colours[border[:, 0]]) / length)),
         _extended(surface.weights, weights),
         _extended(surface.views, np.zeros(len(which))),

@@ -104,3 +104,13 @@ def test_what_is_no_ring_stays() -> None:
     fan = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]])
     book = replace(whole, triangles=fan)
     assert close_holes(book) is book
+
+
+def test_a_hole_without_an_area_gets_no_normal_of_nan() -> None:
+    whole, gone = sheet(), square(5, 5, 1)
+    ring = np.flatnonzero(square(4, 4, 3) & ~gone)
+    vertices = whole.vertices.copy()
+    vertices[ring] = vertices[ring[0]] + 0.001 * np.arange(len(ring))[:, None] * [1, 0, 0]
+    found = close_holes(replace(whole, vertices=vertices).select(~gone))
+    assert len(found.vertices) == len(vertices)  # one for that which is gone
+    assert np.isfinite(found.normals).all()
