@@ -140,7 +140,8 @@ def map_frame(saved: SavedMap, cloud: DenseCloud) -> tuple[Array, str]:
 
     Up is near gravity's, if an accelerometer or an IMU was in the graph, else near the cameras'.
     The floor is that of the points with a floor's label where there are enough, else the lowest
-    level of points that face up. Its plane says up exactly, unless it is a slope by gravity.
+    level of points that face up, or of all if none does. Its plane says up exactly, unless it is a
+    slope by gravity.
 
     Raises:
         InputError: an empty cloud.
@@ -158,12 +159,14 @@ def map_frame(saved: SavedMap, cloud: DenseCloud) -> tuple[Array, str]:
         if len(floor) >= MIN_FLOOR_POINTS:
             break
     by_labels = level is labelled
-    up, floor_m = fit_floor(floor, up, floor_height(floor @ up))
+    seen = floor if len(floor) else points  # of walls alone the lowest part
+    up, floor_m = fit_floor(floor, up, floor_height(seen @ up))
     if gravity is not None and up @ gravity < np.cos(np.deg2rad(GRAVITY_DEG)):
-        up, floor_m = gravity, floor_height(floor @ gravity)
+        up, floor_m = gravity, floor_height(seen @ gravity)
     guessed = (
         "the points labelled floor" if by_labels else "level surfaces and the cameras' attitude"
     )
     text = f"up by {guessed if gravity is None else 'gravity, which was measured'}, the floor by "
-    text += "its labels" if by_labels else "the lowest level"
+    lowest = "the lowest level" if len(floor) else "the lowest points, since none faces up"
+    text += "its labels" if by_labels else lowest
     return make_pose(axes_along_walls(up, normals), np.array([0.0, 0.0, -floor_m])), text

@@ -125,6 +125,15 @@ def test_a_small_floor_with_a_label_below_a_large_table() -> None:
         assert text == (by_labels if label == "floor" else guessed)
 
 
+def test_of_walls_alone_the_lowest_points_are_the_floor() -> None:
+    """They begin 0.3 m above the floor, 0.9 m below the camera."""
+    walls = [level((x, -1.0, 0.3), (1.5, 2.0), "background", slope_deg=90) for x in (2.0, 3.0)]
+    found, text = found_frame(walls, 10.0, np.array([0.0, 0.0, 1.0]))
+    assert np.linalg.norm(found[2, :2]) < 0.005
+    assert found[2, 3] == pytest.approx(-0.32, abs=0.03)  # the lowest 8 cm of them
+    assert text.endswith("the floor by the lowest points, since none faces up")
+
+
 @pytest.mark.parametrize("label", ["floor", "background"])
 def test_a_camera_held_at_40_degrees_gives_a_level_floor(label: str) -> None:
     check_level(found_frame([level(*FLOOR, label), level(*TABLE, "table")], 40.0, None)[0])
