@@ -99,7 +99,8 @@ def plan_frame(points: Array, normals: Array, first_guess: Array, cell_m: float)
     """The plan's frame by points (N, 3) with normals: up from the floor, right along the walls."""
     up = up_direction(normals, first_guess)
     facing = points[normals @ up > UPRIGHT_COSINE].astype(float)
-    up, floor_m = fit_floor(facing, up, floor_height(facing @ up))
+    seen = facing if len(facing) else points.astype(float)  # of walls alone the lowest part
+    up, floor_m = fit_floor(facing, up, floor_height(seen @ up))
     return PlanFrame(axes_along_walls(up, normals), floor_m, cell_m)
 
 

@@ -72,6 +72,16 @@ def test_walls_do_not_tilt_the_up_direction(noise: float) -> None:
     assert frame.floor_m == pytest.approx(0.0, abs=0.01)
 
 
+def test_the_lowest_part_of_walls_alone_is_the_floor() -> None:
+    """Not the height of the camera, where the world begins."""
+    given = room(np.eye(3))
+    walls = given.select(np.abs(given.normals[:, 2]) < 0.5)
+    points = walls.points + np.array([0, 0, -1.2], np.float32)
+    frame = plan_frame(points, walls.normals, np.array([0.0, 0, 1]), 0.05)
+    np.testing.assert_allclose(frame.axes[2], [0, 0, 1], atol=1e-9)
+    assert frame.floor_m == pytest.approx(-1.2, abs=0.06)
+
+
 def test_up_is_found_from_a_tilted_initial_guess() -> None:
     guess = TURN @ np.array([0.4, -0.3, 1.0])
     np.testing.assert_allclose(up_direction(room(TURN).normals, guess), TURN[:, 2], atol=1e-5)
