@@ -31,9 +31,9 @@ class FrameTable:
     """The frames that a run processed, N of them; the fields are those of `FrameResult`.
 
     Attributes:
-        index: (N,), position in the sequence.
+        index: (N,), position in the sequence; a live run counts the frames that it tracked.
         timestamps_s: (N,).
-        status: N of "OK", "WEAK" and "LOST".
+        status: N names of `TrackingStatus`.
         segment: (N,), number of the map segment.
         matches, inliers, ignored: (N,), numbers of features.
         mostly_moving: (N,).
