@@ -170,10 +170,11 @@ class DenseMapper:
     def relabel(self, keyframe_id: int, instances: NDArray[np.uint16], hidden: Mask) -> None:
         """Replace the instances (H, W) of a keyframe and remove the depth of its hidden pixels.
 
-        Nothing happens if the keyframe does not wait for neighbours.
+        One that was fused already gives later ones no such depth from then on. Nothing happens if
+        it is not held any more.
         """
         for k, prepared in enumerate(self._prepared):
-            if prepared.keyframe.id == keyframe_id and keyframe_id in self._to_fuse:
+            if prepared.keyframe.id == keyframe_id:
                 depth_m = np.where(hidden, np.float32(np.nan), prepared.keyframe.depth_m)
                 keyframe = replace(
                     prepared.keyframe, instances=instances, depth_m=depth_m, unmatched=hidden

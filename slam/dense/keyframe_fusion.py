@@ -138,6 +138,8 @@ class KeyframeFusion:
     def relabel(self, keyframe_id: int, instances: KeyframeInstances) -> None:
         """Replace the instances of a keyframe whose masks came late, whether it waits or is saved.
 
+        Keyframes that are fused after that get nothing from what it hides.
+
         Raises:
             InputError: the disk is full.
         """
@@ -147,7 +149,7 @@ class KeyframeFusion:
             self._folder.relabel(keyframe_id, hidden, evidence)
         elif keyframe_id in self._evidence:
             self._evidence[keyframe_id] = evidence
-            self._mapper.relabel(keyframe_id, numbers, hidden)
+        self._mapper.relabel(keyframe_id, numbers, hidden)
 
     def remove(self, keyframe_ids: Collection[int]) -> None:
         """Remove keyframes that left the map, with what was saved of them."""

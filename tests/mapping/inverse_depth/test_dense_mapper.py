@@ -130,6 +130,25 @@ def test_late_labels_have_the_effect_of_early_ones() -> None:
     assert found[3].keyframe.instances is numbers
 
 
+def test_labels_of_a_fused_keyframe_take_its_depth_from_later_ones() -> None:
+    """A person whose masks came late is not given back to keyframes that hide it themselves."""
+    given, none = keyframes(12), np.zeros((30, 40), np.uint16)
+    moves = np.zeros((30, 40), bool)
+    moves[5:15, 8:20] = True
+    hidden = np.where(moves, np.float32(np.nan), given[1].depth_m)
+    relabelled = replace(given[1], depth_m=hidden, instances=none, unmatched=moves)
+    expected = all_of(DenseMapper(CAMERA), [relabelled if k.id == 1 else k for k in given])
+    plain = all_of(DenseMapper(CAMERA), given)
+    mapper = DenseMapper(CAMERA)
+    found = [r for k in given[:8] for r in mapper.add(k)]
+    assert [r.keyframe.id for r in found] == [0, 1]
+    mapper.relabel(1, none, moves)
+    found += [r for k in given[8:] for r in mapper.add(k)] + mapper.flush()
+    assert not np.array_equal(plain[2].map.rho.numpy(), expected[2].map.rho.numpy(), equal_nan=True)
+    for a, b in zip(found[2:], expected[2:], strict=True):
+        np.testing.assert_array_equal(a.map.rho.numpy(), b.map.rho.numpy())
+
+
 def swept_keyframes(count: int) -> list[DenseKeyframe]:
     """Keyframes without depth that move along a textured wall, two pixels to the right each."""
     rough = np.random.default_rng(5).uniform(0, 255, (30, 40 + 2 * count, 3))
