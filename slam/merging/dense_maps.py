@@ -27,7 +27,8 @@ def merge_dense_maps(
 ) -> MapSummary | None:
     """The dense map of a merged run, if all runs have one that was made in the same way.
 
-    Else, or if it cannot be made, the log says why. ``landmarks`` know what was fused into what.
+    Else, or if it cannot be made, as on a full disk, the log says why. ``landmarks`` know what was
+    fused into what.
     """
     having = [source for source in sources if (source.path / "dense" / "settings.json").is_file()]
     if len(having) < len(sources):
@@ -59,7 +60,7 @@ def merge_dense_maps(
                 taken = folder.take_over(part, new_ids, new_landmarks)
                 logger.info("%s: %d fused keyframes taken over", part.path, taken)
         return map_run(options)
-    except (InputError, KeyError, TypeError, ValueError, IndexError) as error:
+    except (InputError, OSError, KeyError, TypeError, ValueError, IndexError) as error:
         logger.warning("no dense map: %s; %s", error, _cure(run))
         return None
 
