@@ -27,8 +27,7 @@ def merge_dense_maps(
 ) -> MapSummary | None:
     """The dense map of a merged run, if all runs have one that was made in the same way.
 
-    Else, or if it cannot be made, as on a full disk, the log says why. ``landmarks`` know what was
-    fused into what.
+    Else, or if it cannot be made (a full disk), the log says why. ``landmarks`` know the fusions.
     """
     having = [source for source in sources if (source.path / "dense" / "settings.json").is_file()]
     if len(having) < len(sources):
