@@ -24,6 +24,7 @@ from bmask_slam.graph.geometry import (
 
 MAX_TIME_DIFFERENCE_S = 0.02
 MAX_STAMP_ERROR_S = 1e-5  # of stamps with six decimals
+GAP_STEPS = 5  # frames without a pose, at the usual rate: a gap in the path
 MAX_TYPICAL_STEP_S = 5.0
 TUM_HEADER = "# timestamp_s tx ty tz qx qy qz qw (T_world_camera, metres)"
 
@@ -94,6 +95,14 @@ class Trajectory:
     def moved(self, T_new_world: Array) -> Trajectory:
         """The same motion seen from another world frame: ``T_new_camera``."""
         return Trajectory(self.timestamps_s, T_new_world @ self.poses_world_camera)
+
+
+def rows_after_gaps(timestamps_s: Array) -> Ints:
+    """The rows of stamps (N,), in order, before which so much is missing that no line is drawn."""
+    if len(timestamps_s) < 3:
+        return np.zeros(0, np.int64)
+    step_s = np.diff(timestamps_s)
+    return np.flatnonzero(step_s > GAP_STEPS * np.median(step_s)) + 1
 
 
 def nearest_indices(stamps_s: Array, queries_s: Array) -> Ints:

@@ -181,15 +181,18 @@ class FloorPlan:
             closed = cv2.erode(grown, kernel, anchor=(size[1] - 1, size[0] - 1))
             grid[(closed[inside] > 0) & (grid < 0)] = wall
 
-    def picture(self, path_world: Array) -> Image:
-        """The plan (H, W, 3), red first, with scale bar, legend and the camera's path (N, 3)."""
+    def picture(self, path_world: Array, begins: Ints | None = None) -> Image:
+        """The plan (H, W, 3), red first, with scale bar, legend and the camera's path (N, 3).
+
+        ``begins`` are rows of the path that no line leads to.
+        """
         grid, path = self.grid(path_world)
         scale = max(1, round(900 / max(grid.shape)))
         names = self._names
         colours = np.vstack([[[EMPTY] * 3, FLOOR_COLOUR], palette(names)]).astype(np.uint8)
         image = np.kron(colours[grid + 2], np.ones((scale, scale, 1), np.uint8))
-        line = np.rint(path * scale).astype(np.int32)
-        cv2.polylines(image, [line], False, (220, 30, 30), 2, cv2.LINE_AA)
+        lines = np.split(np.rint(path * scale).astype(np.int32), [] if begins is None else begins)
+        cv2.polylines(image, lines, False, (220, 30, 30), 2, cv2.LINE_AA)
         _write_names(image, grid, names, (scale, self.frame.cell_m))
         margin, white = 40, (EMPTY,) * 3
         image = cv2.copyMakeBorder(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from bmask_slam.dense.surface import FusedMap, frames_a_keyframe, make_surface
+from bmask_slam.dense.surface import FusedMap, frames_a_keyframe, lost_before, make_surface
 from bmask_slam.dense.views import VIEWS, write_mesh_view, write_views
 from bmask_slam.graph.arrays import Floats, Ints
 from bmask_slam.graph.errors import InputError
@@ -101,7 +101,8 @@ def write_products(
         plan = FloorPlan(plan_frame(points, normals, fused.run.up_guess(), PLAN_CELL_M), names)
         plan.add(cloud)
         path_world = np.stack([k.T_world_camera[:3, 3] for k in evidence.keyframes])
-        written.append(write_picture(folder.path / "plan.png", plan.picture(path_world)))
+        begins = lost_before(fused.run.path, [k.timestamp_s for k in evidence.keyframes])
+        written.append(write_picture(folder.path / "plan.png", plan.picture(path_world, begins)))
     written += write_views(fused, cloud, names)
     written += _write_excluded(fused, evidence, table)
     for name in {*CLOUDS, *OF_SURFACE * changed} - {path.name for path in written}:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.files.whole_file import remove, writing
-from bmask_slam.graph.trajectory import nearest_indices, read_tum
+from bmask_slam.graph.trajectory import nearest_indices, read_tum, rows_after_gaps
 from bmask_slam.mapping.inverse_depth.depth_map import MeasurementConfig, from_sensor
 from bmask_slam.mapping.inverse_depth.regularisation import regularise
 from bmask_slam.mapping.products.surface_labels import dilate
@@ -252,6 +252,18 @@ def tracked_frames(run: MappedRun) -> list[tuple[int, Array]]:
     same &= ~np.isin(trajectory.timestamps_s, _reckoned_s(run.path / FRAMES))
     poses = trajectory.poses_world_camera
     return [(int(nearest[k]), poses[k]) for k in np.flatnonzero(same).tolist()]
+
+
+def lost_before(run: Path, stamps_s: Sequence[float]) -> Ints:
+    """The rows of stamps (N,) before which frames are missing in the run's trajectory.txt.
+
+    There the camera was lost, or another recording begins.
+    """
+    path = run / "trajectory.txt"
+    found_s = read_tum(path).timestamps_s if path.is_file() else np.zeros(0)
+    rows = rows_after_gaps(found_s)
+    gaps_before = np.searchsorted((found_s[rows] + found_s[rows - 1]) / 2, stamps_s)
+    return np.flatnonzero(np.diff(gaps_before) > 0) + 1
 
 
 def _reckoned_s(path: Path) -> Array:

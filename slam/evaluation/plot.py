@@ -17,12 +17,17 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.graph.metrics import AbsoluteError, absolute_error
-from bmask_slam.graph.trajectory import Trajectory, associate, nearest_indices
+from bmask_slam.graph.trajectory import (
+    GAP_STEPS,
+    Trajectory,
+    associate,
+    nearest_indices,
+    rows_after_gaps,
+)
 
 ESTIMATE, REFERENCE, DIFFERENCE = "#1f5fa8", "#9a9a96", "#d6302a"
 MARGINS = {"left": 0.075, "right": 0.985, "bottom": 0.105, "top": 0.915}
 """Of the plot; a layout that measures all of its text takes half of the time of drawing it."""
-GAP_STEPS = 5
 FORMATS = ("png", "pdf", "svg")
 MARKS = {
     EventKind.LOOP_REFUSED: ("x", "#8a8a86", 3.0),
@@ -197,8 +202,4 @@ def path_with_gaps(trajectory: Trajectory) -> Array:
 def _with_gaps(timestamps_s: Array, values: Array) -> Array:
     """Columns (stamp, values...) with a row of NaN in each gap, so that no line crosses it."""
     rows = np.column_stack([timestamps_s, values])
-    if len(rows) < 3:
-        return rows
-    step_s = np.diff(timestamps_s)
-    gaps = np.flatnonzero(step_s > GAP_STEPS * np.median(step_s)) + 1
-    return np.insert(rows, gaps, np.nan, axis=0)
+    return np.insert(rows, rows_after_gaps(timestamps_s), np.nan, axis=0)

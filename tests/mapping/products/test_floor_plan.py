@@ -122,6 +122,18 @@ def test_the_picture_includes_a_path_outside_the_map() -> None:
     assert length == pytest.approx(scale * np.linalg.norm(line[1] - line[0]), abs=4)
 
 
+def test_no_line_leads_where_the_path_begins_again() -> None:
+    cloud = room(np.eye(3))
+    plan = FloorPlan(plan_frame(cloud.points, cloud.normals, np.array([0, 0, 1.0]), 0.05), NAMES)
+    plan.add(cloud)
+    path = np.array([[1.0, 1, 1], [2.0, 1, 1], [5.0, 1, 1], [6.0, 1, 1]])
+    red = [
+        int((plan.picture(path, begins) == (220, 30, 30)).all(axis=2).sum())
+        for begins in (None, np.array([2]))
+    ]
+    assert red[1] == pytest.approx(0.4 * red[0], rel=0.1)
+
+
 def test_the_nearer_point_is_on_top() -> None:
     camera = Camera(20, 16, fx=20, fy=20, cx=10, cy=8)
     points = np.array([[0, 0, 0.0], [0, 0, 1.0], [0.1, 0, 0.0], [0, 0, -2.0]])

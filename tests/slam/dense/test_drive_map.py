@@ -18,6 +18,7 @@ from ruamel.yaml import YAML
 from bmask_slam.cli import main
 from bmask_slam.dense.drive_map import DriveFormat, DriveMapOptions, export_drive_map, map_frame
 from bmask_slam.dense.saved_map import SavedMap, read_saved_map
+from bmask_slam.dense.surface import lost_before
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
@@ -27,6 +28,7 @@ from bmask_slam.graph.factors.graph_update import GRAVITY, RelativePose, referen
 from bmask_slam.graph.files.array_file import nested, part, read_arrays, write_arrays
 from bmask_slam.graph.geometry import inverse, make_pose, so3_exp, transform
 from bmask_slam.graph.smoother.storage import graph_arrays
+from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap, write_depth_map
 from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.cloud_files import CloudWriter
@@ -302,6 +304,16 @@ def test_a_run_without_a_map_is_not_sent_to_make_a_dense_one(run: Path) -> None:
     (run / "map").unlink()
     with pytest.raises(InputError, match="give a finished run, not one with --localise"):
         export_drive_map(run, "nav2", out, options)
+
+
+def test_where_the_camera_was_lost_is_between_two_keyframes(tmp_path: Path) -> None:
+    assert lost_before(tmp_path, [0.0, 1.0]).tolist() == []  # no trajectory
+    stamps_s = np.concatenate([np.arange(30), 90 + np.arange(30)]) / 30
+    poses = np.tile(np.eye(4), (len(stamps_s), 1, 1))
+    write_tum(tmp_path / "trajectory.txt", Trajectory(stamps_s, poses))
+    keyframes_s = [*stamps_s[[0, 10, 29]].tolist(), *stamps_s[[30, 45]].tolist()]
+    assert lost_before(tmp_path, keyframes_s).tolist() == [3]
+    assert lost_before(tmp_path, keyframes_s[:3]).tolist() == []
 
 
 def test_the_map_is_of_the_segment_that_the_trajectory_is_of(run: Path) -> None:
