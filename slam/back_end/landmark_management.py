@@ -107,7 +107,8 @@ def fuse_into(
 ) -> Ints:
     """Search landmarks in further keyframes.
 
-    A free keypoint there becomes one more observation; one that has another landmark shows a
+    A free keypoint there becomes one more observation, unless the keyframe observes the landmark
+    already: one landmark has one place in an image. One that has another landmark shows a
     duplicate, and the younger is fused into the older. Returns the ids removed.
     """
     removed = [np.zeros(0, np.int64)]
@@ -117,7 +118,8 @@ def fuse_into(
         matched, old_ids = visible[matches.query], keyframe.landmark_ids[matches.train]
         old = old_ids >= 0
         old[old] = world.landmarks.in_map[old_ids[old]]
-        world.attach(keyframe, matches.train[~old], matched[~old])
+        new = ~old & ~np.isin(matched, keyframe.landmark_ids)
+        world.attach(keyframe, matches.train[new], matched[new])
         pairs = np.sort(np.stack([matched[old], old_ids[old]], axis=1), axis=1)
         pairs = pairs[pairs[:, 0] != pairs[:, 1]]
         if len(pairs):

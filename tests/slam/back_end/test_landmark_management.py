@@ -17,9 +17,11 @@ from bmask_slam.back_end.landmark_management import (
     MappingConfig,
     create_landmarks,
     cull_landmarks,
+    fuse_into,
     fuse_into_neighbours,
     redundant_keyframe,
 )
+from bmask_slam.features.brisk import select
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
@@ -74,6 +76,20 @@ def test_free_keypoints_of_neighbours_observe_the_new_landmarks() -> None:
     removed = fuse_into_neighbours(world, second, new, TRACKER, CONFIG)
     assert len(removed) == 0
     assert (first.landmark_ids[20:] == new).all()
+
+
+def test_a_keyframe_observes_a_landmark_at_one_keypoint() -> None:
+    """Another one beside it looks more like the landmark does since; both are within the gate."""
+    world, points_world, (first, second, third) = scene(3)
+    (landmark,) = ids = world.make_landmarks(first, np.array([0]), points_world[:1])
+    second.features = select(second.features, np.r_[0, 0, 2:60])
+    second.features.pixels[1, 0] += 0.5
+    second.features.descriptors[0] = ~second.features.descriptors[0]
+    for keyframe in (second, third):
+        world.attach(keyframe, np.array([0]), ids)
+    assert not len(fuse_into(world, [second], ids, TRACKER, CONFIG.fuse_radius_px))
+    assert np.flatnonzero(second.landmark_ids == landmark).tolist() == [0]
+    assert world.landmarks.observations[landmark] == 3
 
 
 def test_landmarks_rarely_matched_or_observed_once_are_culled() -> None:
