@@ -118,6 +118,8 @@ class SelfCalibrator:
         looked = before.adopted or (self.finished and not before.settled)
         if self._mode != "auto" or not looked or not isinstance(system, SlamSystem):
             return False
+        if len(system.trajectory()) < self._config.min_frames:  # of a map that was continued
+            return False
         estimate = self._estimate(system, sequence)
         if estimate is not None and estimate.in_other_order:
             system.events.calibration(with_other_order(before, "report").text)

@@ -200,6 +200,19 @@ def test_a_run_that_continues_a_map_looks_again_and_the_map_follows(
     assert ate_m(done) < 1.1 * ate_m(off)
 
 
+def test_few_frames_that_continue_a_map_do_not_change_its_camera(
+    late_sweep: Path, sweep_camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    third = replace(sweep_camera, depth_time_offset_s=sweep_camera.depth_time_offset_s / 3)
+    sequence, system = open_sequence(late_sweep, camera=third), SlamSystem(third, CONFIG)
+    for frame in sequence.frames(0, FRAMES - 1):
+        system.process(frame)
+    inherited = SelfCalibration(read_camera(late_sweep / "camera.yaml"), third, "a third")
+    calibrator = SelfCalibrator(inherited, "auto")
+    monkeypatch.setattr(calibrator, "_estimate", lambda *_: pytest.fail("it looked"))
+    assert not calibrator.look_back(system, sequence)
+
+
 def test_a_map_that_is_continued_follows_a_bend_of_depth(
     late_sweep: Path, sweep_camera: Camera
 ) -> None:
