@@ -156,6 +156,11 @@ def make_problem(
     """The problem for the solver, and the ids (K,) of its keyframes."""
     stamps_s = dict(zip(run.tables.keyframes.ids.tolist(), run.keyframe_stamps_s, strict=True))
     reader = SequenceDepths(stamps_s, sequence)
+    if not len(reader.keyframe_ids):
+        raise InputError(
+            f"{sequence.folder}: has no image of a keyframe of {run.path}, so it is another "
+            "recording; give the run's own by --sequence"
+        )
     observations = connected_views(run.tables, reader.keyframe_ids, MAX_KEYFRAMES)
     count = len(np.unique(observations.keyframe_ids))
     if count < MIN_KEYFRAMES:

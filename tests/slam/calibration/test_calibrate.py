@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -193,3 +194,16 @@ def test_two_rounds_rerun_with_the_found_camera(
     assert found[0] != found[1]
     for camera in found:
         assert camera.fx == pytest.approx(truth.fx, rel=0.01)
+
+
+def test_the_images_of_another_recording_are_named(made: tuple[Path, Path], tmp_path: Path) -> None:
+    sequence, run = made
+    other = tmp_path / "other"
+    shutil.copytree(sequence, other)
+    for name in ("rgb.txt", "depth.txt"):
+        rows = [line.split() for line in (sequence / name).read_text().splitlines()]
+        later = [f"{float(row[0]) + 100} {row[1]}" for row in rows if row[0] != "#"]
+        (other / name).write_text("\n".join(later) + "\n")
+    options = CalibrateOptions(run, tmp_path / "camera.yaml", sequence=other)
+    with pytest.raises(InputError, match=f"{other}: has no image of a keyframe of {run}"):
+        calibrate_run(options)
