@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints, Mask
-from bmask_slam.graph.errors import InputError, finite_number
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import read_table
 from bmask_slam.tracking.results import FrameResult
 
@@ -79,25 +79,24 @@ def read_frames(path: Path) -> FrameTable:
     """Read a frames.csv; a last line that was cut off is ignored.
 
     Raises:
-        InputError: no such file, a column that is missing, or a value that is no number, such as a
-            stamp of NaN.
+        InputError: no such file, a column that is missing, or a value that is no number.
     """
     columns = read_table(path, _NEEDED, "run again", growing=True)
     absent = ("",) * len(columns["index"])  # a column that older versions did not write
     try:
-        return _table({name: columns.get(name, absent) for name in COLUMNS}, path)
+        return _table({name: columns.get(name, absent) for name in COLUMNS})
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: {error}; run again") from error
 
 
-def _table(columns: dict[str, tuple[str, ...]], path: Path) -> FrameTable:
+def _table(columns: dict[str, tuple[str, ...]]) -> FrameTable:
     def numbers(name: str, empty: float, kind: Callable[[str], Any] = int) -> Any:
         values = [kind(text) if text else empty for text in columns[name]]
         return np.array(values, float if kind is float else np.int64)
 
     return FrameTable(
         index=numbers("index", -1),
-        timestamps_s=np.array([finite_number(text, str(path)) for text in columns["timestamp"]]),
+        timestamps_s=numbers("timestamp", np.nan, float),
         status=columns["status"],
         segment=numbers("segment", 0),
         matches=numbers("matches", 0),

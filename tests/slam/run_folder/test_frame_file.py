@@ -71,14 +71,6 @@ def test_a_value_that_is_no_number_is_refused(tmp_path: Path) -> None:
         read_frames(tmp_path / "none.csv")
 
 
-@pytest.mark.parametrize("stamp", ["", "nan", "inf", "1e300", "now"])
-def test_a_stamp_that_is_no_time_is_refused(tmp_path: Path, stamp: str) -> None:
-    path = tmp_path / "frames.csv"
-    path.write_text(f"index,timestamp,status,keyframe\n0,0.5,OK,0\n1,{stamp},OK,\n2,0.7,OK,\n")
-    with pytest.raises(InputError, match=rf"frames\.csv: '{stamp}' is not a finite number"):
-        read_frames(path)
-
-
 EVENTS = (
     Event(3, 1305031102.175304, EventKind.CALIBRATION, 'rolling shutter 17.0 ± 2.2 ms, "found"'),
     Event(4, 1305031102.211214, EventKind.LOOP_REFUSED, "keyframes 3 and 9: too few, limit 15"),
