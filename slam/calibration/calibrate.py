@@ -28,6 +28,7 @@ from bmask_slam.graph.calibration.model import (
 from bmask_slam.graph.calibration.problem import Anchors, CalibrationProblem
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.files.whole_file import check_target
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.metrics import align
@@ -156,18 +157,8 @@ def make_problem(
     """The problem for the solver, and the ids (K,) of its keyframes."""
     stamps_s = dict(zip(run.tables.keyframes.ids.tolist(), run.keyframe_stamps_s, strict=True))
     reader = SequenceDepths(stamps_s, sequence)
-    if not len(reader.keyframe_ids):
-        raise InputError(
-            f"{sequence.folder}: has no image of a keyframe of {run.path}, so it is another "
-            "recording; give the run's own by --sequence"
-        )
     observations = connected_views(run.tables, reader.keyframe_ids, MAX_KEYFRAMES)
-    count = len(np.unique(observations.keyframe_ids))
-    if count < MIN_KEYFRAMES:
-        raise InputError(
-            f"{run.path}: {count} keyframes share landmarks, too few to calibrate; use a run with "
-            f"at least {MIN_KEYFRAMES}, better 20 or more"
-        )
+    _check_enough(run, reader, observations)
     motion = landmark_motion(observations, run)
     views, keyframe_ids, landmark_ids = make_views(observations, reader, motion)
     poses = run.tables.keyframes.get(keyframe_ids)
@@ -194,6 +185,21 @@ def make_problem(
         views, poses, points, start, sigmas, gauge, anchors if has_anchor else None
     )
     return problem, keyframe_ids
+
+
+def _check_enough(run: SavedRun, reader: SequenceDepths, observations: Observations) -> None:
+    """Refuse images of another recording, and observations of few keyframes. Raises InputError."""
+    if not len(reader.keyframe_ids):
+        raise InputError(
+            f"{reader.sequence.folder}: has no image of a keyframe of {run.path}, so it is another "
+            "recording; give the run's own by --sequence"
+        )
+    count = len(np.unique(observations.keyframe_ids))
+    if count < MIN_KEYFRAMES:
+        raise InputError(
+            f"{run.path}: {count} keyframes share landmarks, too few to calibrate; use a run with "
+            f"at least {MIN_KEYFRAMES}, better 20 or more"
+        )
 
 
 def _reference_positions(path: Path, stamps_s: Array, poses: Array) -> tuple[Array, Array]:

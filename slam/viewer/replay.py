@@ -62,7 +62,7 @@ def replay(path: Path, scene: Scene, options: ReplayOptions | None = None) -> in
     _show_map(run, scene)
     try:
         frames = _frame_results(table, trajectory, _events(path))
-    except ValueError as error:  # of TrackingStatus
+    except ValueError as error:
         raise InputError(f"{path / FRAMES}: {error}; run again") from error
     uncertain = _show_uncertainty(path, scene)
     began_s = time.monotonic()
@@ -169,7 +169,9 @@ def _boxes(run: Path) -> list[Box]:
 def _frame_results(
     frames: FrameTable, trajectory: Trajectory, events: dict[int, list[Event]]
 ) -> list[FrameResult]:
-    """The frames of a run with their final poses."""
+    """The frames of a run with their final poses. Raises ValueError for what no run writes."""
+    if not np.isfinite(frames.timestamps_s).all():
+        raise ValueError("a stamp is not a finite number")
     near = known = np.zeros(len(frames), int)
     if len(trajectory):
         near = nearest_indices(trajectory.timestamps_s, frames.timestamps_s)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -99,6 +100,15 @@ def test_a_window_without_its_program_is_one_line(monkeypatch) -> None:
     monkeypatch.setenv("PATH", "")
     with pytest.raises(InputError, match=r"window does not open .*--record"):
         Scene("a", ViewOptions(window=True))
+
+
+def test_a_stamp_that_is_no_time_is_one_line(recorded: Path, tmp_path: Path, capsys) -> None:
+    run = shutil.copytree(recorded / "run", tmp_path / "run")
+    lines = (run / "frames.csv").read_text().splitlines()
+    lines[4] = ",".join(["3", "nan", *lines[4].split(",")[2:]])
+    (run / "frames.csv").write_text("\n".join(lines) + "\n")
+    assert main(["view", str(run), "--record", str(tmp_path / "a.rrd")]) == 1
+    assert f"{run / 'frames.csv'}: a stamp is not a finite number; run" in capsys.readouterr().err
 
 
 def test_a_run_whose_masks_lack_images_is_shown_without_them(tmp_path, caplog) -> None:
