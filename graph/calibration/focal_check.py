@@ -39,8 +39,12 @@ class FocalCheck:
 
     def surely_beyond(self, limit: float) -> bool:
         """Whether 95 % bounds, and both halves of the run by at least half, exceed a limit."""
+        return self.is_beyond(limit, NORMAL_95 * self.sigma)
+
+    def is_beyond(self, limit: float, margin: float = 0.0) -> bool:
+        """Whether the change, less a margin, and both halves by at least half exceed a limit."""
         sign = np.sign(self.change)
-        beyond = abs(self.change) - NORMAL_95 * self.sigma > limit
+        beyond = abs(self.change) - margin > limit
         return bool(beyond and all(sign * half > limit / 2 for half in self.halves))
 
 

@@ -173,14 +173,16 @@ def _focal_again(run: SavedRun, sequence: Sequence, world: WorldMap) -> FocalChe
 def _focal(check: FocalCheck | None, again: FocalCheck | None, camera: Camera) -> _Finding:
     if check is None:
         return _Finding("focal length: not observable, too few views")
-    limit = MAX_FOCAL_CHANGE
+    sure = check.surely_beyond(MAX_FOCAL_CHANGE)
     if again is not None:
-        check, limit = again, MAX_FOCAL_CHANGE / SHOWN_BY_TRACKED
+        limit = MAX_FOCAL_CHANGE / SHOWN_BY_TRACKED
+        sure = again.surely_beyond(limit) or (sure and again.is_beyond(limit))
+        check = again
     change, bound = 100 * check.change, 100 * NORMAL_95 * check.sigma
     rows = (row("camera_focal_change", change, "%"), row("camera_focal_change_95", bound, "%"))
     more = "more" if change > 0 else "less"
     shown = f"{abs(change):.1f} ± {bound:.1f} % {more} than the camera's {camera.fx:.1f} px"
-    if check.surely_beyond(limit):
+    if sure:
         text = f"focal length: the motion shows {shown}; check the calibration, or find it by "
         return _Finding(f"{text}bmask-slam calibrate RUN", True, rows)
     if NORMAL_95 * check.sigma > MAX_FOCAL_BOUND:

@@ -107,19 +107,34 @@ def test_a_wrong_focal_length_is_named(
     assert (" % less than" if share > 0 else " % more than") in warning
 
 
-@pytest.mark.parametrize(("share", "warned"), [(0.004, False), (0.022, False), (0.03, True)])
+@pytest.mark.parametrize(
+    ("stored_share", "found", "warned"),
+    [
+        (0.024, (0.004, 0.002), False),
+        (0.024, (0.022, 0.002), False),
+        (0.017, (0.03, 0.002), True),
+        (0.024, (0.03, 0.006), True),  # sure together
+        (0.017, (0.03, 0.006), False),
+    ],
+)
 def test_landmarks_that_are_found_again_decide_about_a_doubtful_focal_length(
-    right: RunSummary, late_sweep: Path, monkeypatch: pytest.MonkeyPatch, share: float, warned: bool
+    right: RunSummary,
+    late_sweep: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    stored_share: float,
+    found: tuple[float, float],
+    warned: bool,
 ) -> None:
     """They show all of an error, the matches of tracking two thirds: the limit is 2.25 %."""
-    stored, again = FocalCheck(0.024, 0.003, (0.02, 0.02)), FocalCheck(share, 0.002, (share, share))
-    answers = [stored, again]
+    share, sigma = found
+    stored = FocalCheck(stored_share, 0.003, (0.02, 0.02))
+    answers = [stored, FocalCheck(share, sigma, (share, share))]
     monkeypatch.setattr(camera_check, "check_focal", lambda problem: answers.pop(0))
     state, camera = read_map(right.folder)
     run, sequence = read_run(right.folder), open_sequence(late_sweep, camera=camera)
-    found = check_camera(run, sequence, world_of(part(state, "mapper.world")))
-    assert not answers and bool(found.warnings) is warned
-    rows = {row["name"]: row["value"] for row in found.rows}
+    checked = check_camera(run, sequence, world_of(part(state, "mapper.world")))
+    assert not answers and bool(checked.warnings) is warned
+    rows = {row["name"]: row["value"] for row in checked.rows}
     assert rows["camera_focal_change"] == pytest.approx(100 * share)
 
 
