@@ -175,8 +175,8 @@ def _focal(check: FocalCheck | None, again: FocalCheck | None, camera: Camera) -
         return _Finding("focal length: not observable, too few views")
     sure = check.surely_beyond(MAX_FOCAL_CHANGE)
     if again is not None:
-        limit = MAX_FOCAL_CHANGE / SHOWN_BY_TRACKED
-        sure = again.surely_beyond(limit) or (sure and again.is_beyond(limit))
+        limit, same = MAX_FOCAL_CHANGE / SHOWN_BY_TRACKED, check.change * again.change > 0
+        sure = same and (again.surely_beyond(limit) or (sure and again.is_beyond(limit)))
         check = again
     change, bound = 100 * check.change, 100 * NORMAL_95 * check.sigma
     rows = (row("camera_focal_change", change, "%"), row("camera_focal_change_95", bound, "%"))

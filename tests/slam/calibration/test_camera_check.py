@@ -115,6 +115,7 @@ def test_a_wrong_focal_length_is_named(
         (0.017, (0.03, 0.002), True),
         (0.024, (0.03, 0.006), True),  # sure together
         (0.017, (0.03, 0.006), False),
+        (0.024, (-0.03, 0.002), False),  # they contradict each other
     ],
 )
 def test_landmarks_that_are_found_again_decide_about_a_doubtful_focal_length(
