@@ -99,8 +99,8 @@ class SystemResults(ABC):
         In a merged map those of recordings that a run had continued have no stamp, and are left
         out.
         """
-        chosen = self.map.world.in_segment(self.largest_segment())
-        chosen = [k for k in chosen if k.id >= self._first_keyframe]
+        segment = self.largest_segment()
+        chosen = [k for k in self.session_keyframes() if k.segment == segment]
         chosen = [k for k in chosen if np.isfinite(k.timestamp_s)]
         poses = np.array([k.T_world_camera for k in chosen]).reshape(-1, 4, 4)
         return Trajectory(np.array([k.timestamp_s for k in chosen]), poses)

@@ -342,12 +342,18 @@ def test_options_out_of_range_are_refused() -> None:
         FrameOptions(-1.0)
 
 
-def test_poses_of_culled_keyframes_are_those_that_their_parents_give_them() -> None:
-    world, history = WorldMap(), FrameHistory()
-    for k, segment in ((0, 0), (1, 0), (2, 5)):
+def world_in_segments(*segments: int) -> WorldMap:
+    """A keyframe in each of these segments, without landmarks."""
+    world = WorldMap()
+    for k, segment in enumerate(segments):
         keyframe = Keyframe.__new__(Keyframe)
         keyframe.id, keyframe.segment, keyframe.T_world_camera = k, segment, POSES[k]
         world.keyframes[k] = keyframe
+    return world
+
+
+def test_poses_of_culled_keyframes_are_those_that_their_parents_give_them() -> None:
+    world, history = world_in_segments(0, 0, 5), FrameHistory()
     T_1_3 = inverse(POSES[1]) @ POSES[3]
     history.hand_over(3, 1, T_1_3)
     history.hand_over(4, 2, T_1_3)
@@ -358,11 +364,7 @@ def test_poses_of_culled_keyframes_are_those_that_their_parents_give_them() -> N
 
 def test_the_surface_follows_the_segment_of_most_frames() -> None:
     """That which trajectory.txt is of, also where another one has more keyframes."""
-    world, history = WorldMap(), FrameHistory()
-    for k, segment in ((0, 5), (1, 0), (2, 0)):
-        keyframe = Keyframe.__new__(Keyframe)
-        keyframe.id, keyframe.segment, keyframe.T_world_camera = k, segment, POSES[k]
-        world.keyframes[k] = keyframe
+    world, history = world_in_segments(5, 0, 0), FrameHistory()
     for k in range(3):
         history.append(0.1 * k, 0, POSES[0], POSES[0])
     assert sorted(MapPoses.of(world, history, set()).by_id()) == [0]
