@@ -104,6 +104,7 @@ REPORTS = {
         ),
         "turns": ("Fast turns", ""),
         "peak": ("Peak of 600 frames", ""),
+        "present_poses": ("Poses and velocities as they are given out", "live.present_poses"),
         "memory": ("Memory of the map", "live.map_memory ../shared/data/redkitchen --frames 600"),
     }, pictures={
         "soak": {"live_soak.png": "Latency, memory, descriptors and keyframes over the hour"},

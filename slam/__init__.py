@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from bmask_slam.sequences.sequence import open_sequence
     from bmask_slam.system import SlamSystem
     from bmask_slam.system_config import SystemConfig
-    from bmask_slam.tracking.results import FrameResult, TrackingStatus
+    from bmask_slam.tracking.results import FrameResult, TrackingStatus, Velocity
 
 __version__ = "0.1.0"
 __all__ = [
@@ -41,6 +41,7 @@ __all__ = [
     "SlamSystem",
     "SystemConfig",
     "TrackingStatus",
+    "Velocity",
     "__version__",
     "evaluate",
     "key_of_keyframe",
@@ -66,6 +67,7 @@ _MODULES = {
     "SlamSystem": "system",
     "SystemConfig": "system_config",
     "TrackingStatus": "tracking.results",
+    "Velocity": "tracking.results",
     "evaluate": "evaluation",
     "key_of_keyframe": "graph.factors.keys",
     "key_of_landmark": "graph.factors.keys",

@@ -24,8 +24,8 @@ class SystemConfig:
 
     ``final_adjustment``: a full bundle adjustment ends the run. ``adjust_frames``: then the map is
     adjusted again, together with the frames that are no keyframes. ``smooth_trajectory``: then the
-    poses of all frames are smoothed by the camera's inertia. ``covariances``: those of all
-    keyframes are written with its results.
+    poses of all frames are smoothed by the camera's inertia; live, they are filtered by it as they
+    are given out. ``covariances``: those of all keyframes are written with its results.
     """
 
     features: FeatureConfig = field(default_factory=FeatureConfig)

@@ -34,6 +34,7 @@ from bmask_slam.semantics.segmenters.segmenter_table import LabelsOnly
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.pose_filter import PoseFilter
 from bmask_slam.tracking.results import FrameResult, Tracked
 from bmask_slam.world.frame_history import NO_KEYFRAME
 from bmask_slam.world.keyframe import Keyframe
@@ -78,8 +79,8 @@ class LiveSystem(SlamSystem):
         self.watch: CoveredWatch | None = None
         self.covered = ""
         self._measured: deque[Measurements] = deque()
-        self._own_factors = -1
-        self._located = 0
+        self._own_factors, self._located = -1, 0
+        self._filter = PoseFilter() if config.smooth_trajectory else None
         self.label_names = (segmenter or NoSegmenter).labels.names
         self.mask_listeners: list[Callable[[Masks], None]] = []
         with ExitStack() as undo:
@@ -104,9 +105,9 @@ class LiveSystem(SlamSystem):
         if seen is not None:
             self._found_covered(*seen)
         result = super().process(frame, features if seen is None else None)
-        if self.calibration is not None:
-            self.calibration.add_frame(frame, self._keyframe(result))
-        return result
+        if found is not None:
+            found.add_frame(frame, self._keyframe(result))
+        return self._filter.filtered(result) if self._filter is not None else result
 
     def _found_covered(self, camera: Camera, text: str) -> None:
         """Leave it out, if the camera is not only told about; a map that grows begins anew."""
@@ -188,7 +189,9 @@ class LiveSystem(SlamSystem):
             tracker.reset(0)
             return
         parent = self.remote.world.keyframes[parent_id]
-        tracker.follow_map(T_before, parent.T_world_camera @ T_parent_reference)
+        T_after = parent.T_world_camera @ T_parent_reference
+        for follower in (tracker, self._filter) if self._filter else (tracker,):
+            follower.follow_map(T_before, T_after)
         tracker.refer_to(parent)
         tracker.segment = parent.segment
 
@@ -246,11 +249,10 @@ class LiveSystem(SlamSystem):
 
     def finish(self) -> None:
         """Let the other processes finish; afterwards this is an offline system with the map."""
-        begin_s = time.monotonic()
+        begin_s, calibration = time.monotonic(), self.calibration
         while self.segmenter and self.segmenter.waiting and time.monotonic() < begin_s + MASKS_S:
             time.sleep(0.02)
             self.catch_up()
-        calibration = self.calibration
         while calibration and calibration.busy and time.monotonic() < begin_s + CALIBRATION_S:
             time.sleep(0.02)
             self.catch_up()

@@ -99,6 +99,19 @@ def reckoned(tracked: Tracked, T_world_camera: Array, motion: Motion) -> Tracked
     return replace(blank, status=status, matches=tracked.matches, information=information)
 
 
+@dataclass(frozen=True, eq=False)
+class Velocity:
+    """A camera's velocity in its own frame.
+
+    Attributes:
+        twist: (6,) [rad/s, m/s].
+        covariance: (6, 6) of it.
+    """
+
+    twist: Array
+    covariance: Array
+
+
 @dataclass(frozen=True)
 class FrameResult:
     """The outcome of one frame.
@@ -107,7 +120,8 @@ class FrameResult:
         index: the frame's position in the sequence.
         timestamp_s: its stamp in seconds.
         status: see TrackingStatus.
-        T_world_camera: (4, 4) pose at the moment of tracking, None when LOST. The final
+        T_world_camera: (4, 4) pose at the moment of tracking, None when LOST; live it is filtered
+            by the camera's inertia (`PoseFilter`), unless ``smooth_trajectory`` is off. The final
             trajectory is composed at the end from the optimised keyframes.
         segment: number of the map segment, from 0; a new one starts after tracking was lost
             until the old one is recognised.
@@ -122,6 +136,7 @@ class FrameResult:
         keyframe_reason: why it was made ("" when it was not).
         stage_ms: wall time of each stage in milliseconds, by name.
         events: what happened since the result before; live, also what other processes sent.
+        velocity: of the camera, where the pose is filtered and frames before it tell.
     """
 
     index: int
@@ -138,6 +153,7 @@ class FrameResult:
     keyframe_reason: str = ""
     stage_ms: dict[str, float] = field(default_factory=dict)
     events: tuple[Event, ...] = ()
+    velocity: Velocity | None = None
 
     @property
     def covariance(self) -> Array | None:

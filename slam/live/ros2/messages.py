@@ -10,6 +10,7 @@ from bmask_slam.graph.arrays import Array, Bytes
 from bmask_slam.graph.geometry import adjoint, make_pose, quaternion_from_rotation
 from bmask_slam.live.ros2.transport import typestore
 from bmask_slam.mapping.products.occupancy import OccupancyGrid
+from bmask_slam.tracking.results import Velocity
 
 UNKNOWN_VARIANCE = 1e6
 PACKAGES = {
@@ -69,6 +70,21 @@ def ros_covariance(covariance: Array | None, T_base_camera: Array, T_map_base: A
     R, Ad = T_map_base[:3, :3], adjoint(T_base_camera)
     J = np.vstack([R @ Ad[3:], R @ Ad[:3]])
     return np.asarray(J @ covariance @ J.T)
+
+
+def ros_twist(velocity: Velocity | None, T_base_camera: Array) -> Any:
+    """A geometry_msgs/TwistWithCovariance of the base in its own frame; -1 where it is unknown.
+
+    Since ``T_world_base = T_world_camera @ T_camera_base`` its twist is ``Ad(T_base_camera)`` times
+    the camera's. ROS has the shift before the turn.
+    """
+    if velocity is None:
+        zero = message("Vector3", 0.0, 0.0, 0.0)
+        return message("TwistWithCovariance", message("Twist", zero, zero), np.full(36, -1.0))
+    J = np.roll(adjoint(T_base_camera), 3, axis=0)
+    shift, turn = np.split(J @ velocity.twist, 2)
+    twist = message("Twist", *(message("Vector3", *part.tolist()) for part in (shift, turn)))
+    return message("TwistWithCovariance", twist, (J @ velocity.covariance @ J.T).ravel())
 
 
 def occupancy_grid(stamp_s: float, frame: str, grid: OccupancyGrid, floor_m: float) -> Any:

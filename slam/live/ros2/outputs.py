@@ -19,6 +19,7 @@ from bmask_slam.live.ros2.messages import (
     point_cloud,
     pose,
     ros_covariance,
+    ros_twist,
     transform,
     type_name,
 )
@@ -153,8 +154,7 @@ class Ros2Outputs:
         T_map_base = self._T_map_world @ result.T_world_camera @ self._T_camera_base
         covariance = ros_covariance(result.covariance, self._robot.T_base_camera, T_map_base)
         where = message("PoseWithCovariance", pose(T_map_base), covariance.ravel())
-        zero = message("Vector3", 0.0, 0.0, 0.0)
-        twist = message("TwistWithCovariance", message("Twist", zero, zero), np.full(36, -1.0))
+        twist = ros_twist(result.velocity, self._robot.T_base_camera)
         frame = f.odom if self._robot.T_odom_base is None else f.map
         self._odometry.send(message("Odometry", header(stamp_s, frame), f.base, where, twist))
         self._pose.send(message("PoseWithCovarianceStamped", header(stamp_s, f.map), where))

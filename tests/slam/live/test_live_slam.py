@@ -87,6 +87,18 @@ def test_live_is_as_good_as_offline_and_leaves_the_same_files(tmp_path, offline)
     assert {"latency_ms_median", "frames_dropped", "isam2_update_ms_median"} <= names
 
 
+def test_poses_are_filtered_as_the_camera_moves_unless_that_is_switched_off() -> None:
+    found = {}
+    for smooth in (True, False):
+        with LiveSlam(CAMERA, replace(CONFIG, smooth_trajectory=smooth)) as slam:
+            found[smooth] = [slam.track(f.timestamp_s, f.rgb, f.depth_m) for f in FRAMES]
+    assert all(result.velocity is None for result in found[False])
+    velocity, step_s = found[True][-1].velocity, FRAMES[1].timestamp_s - FRAMES[0].timestamp_s
+    assert velocity is not None
+    assert velocity.twist[3] == pytest.approx(0.02 / step_s, rel=0.05)  # 2 cm a frame along x
+    assert error_m(np.array([result.T_world_camera for result in found[True]])) < 0.01
+
+
 def test_frames_after_the_end_are_refused_in_one_line(caplog) -> None:
     with LiveSlam(CAMERA, CONFIG) as slam:
         pass

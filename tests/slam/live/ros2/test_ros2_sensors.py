@@ -22,7 +22,7 @@ from bmask_slam.live.ros2.outputs import OPTICAL, Robot, Ros2Frames, Ros2Outputs
 from bmask_slam.live.ros2.sensors import FAR_S, ImageClock, Ros2Sensors, mounted
 from bmask_slam.live.ros2.transport import typestore
 from bmask_slam.sequences.bags.sensors import SensorTopics
-from bmask_slam.tracking.results import FrameResult, TrackingStatus
+from bmask_slam.tracking.results import FrameResult, TrackingStatus, Velocity
 
 CLOCK = ImageClock(1000.0, 0.0)
 
@@ -158,6 +158,28 @@ def test_without_wheels_the_base_moves_in_odom() -> None:
         for t in one.transforms
     ]
     assert links == [("map", "odom"), ("base_link", "camera_optical_frame"), ("odom", "base_link")]
+
+
+def test_the_bases_velocity_is_in_its_own_frame() -> None:
+    """The camera 0.5 m before the axis of a base that turns and drives: v = v_base + w x r."""
+    node = StandIn()
+    T_base_camera = make_pose(OPTICAL[:3, :3], np.array([0.5, 0.0, 0.3]))
+    outputs = Ros2Outputs(node, Ros2Frames(), Robot(T_base_camera))
+    turn, drive = np.array([0.0, 0.0, 0.4]), np.array([1.0, 0.0, 0.0])
+    at_camera = drive + np.cross(turn, T_base_camera[:3, 3])
+    R = T_base_camera[:3, :3].T
+    twist = np.r_[R @ turn, R @ at_camera]
+    found = FrameResult(0, 1.0, TrackingStatus.OK, se3_exp(np.ones(6)))
+    outputs.frame(found)
+    outputs.frame(replace(found, timestamp_s=2.0, velocity=Velocity(twist, 0.01 * np.eye(6))))
+    unknown, known = (one.twist for one in node.topics["/bmask_slam/odometry"])
+    assert (unknown.covariance == -1).all()
+    linear, angular = known.twist.linear, known.twist.angular
+    assert np.allclose([linear.x, linear.y, linear.z], drive)
+    assert np.allclose([angular.x, angular.y, angular.z], turn)
+    covariance = known.covariance.reshape(6, 6)
+    assert np.allclose(covariance[3:, 3:], 0.01 * np.eye(3))
+    assert covariance[1, 1] == pytest.approx(0.01 * (1 + 0.5**2 + 0.3**2))
 
 
 def test_streams_grow_without_being_sorted_anew() -> None:
