@@ -72,7 +72,8 @@ class Channel:
 
     def send(self, message: Any) -> None:
         """Queue a message to be sent in order; does nothing once the channel has ended."""
-        self._outbox.put(message)
+        if self._sender.is_alive():  # else nothing would take it out again
+            self._outbox.put(message)
 
     def receive(self, timeout_s: float = 0.0) -> list[Any]:
         """All messages received so far; waits for the first for at most ``timeout_s``."""

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,18 @@ def test_a_killed_worker_is_detected_and_sending_is_safe() -> None:
         worker.send(np.zeros(100_000))
     assert worker.receive() == []
     worker.stop()
+
+
+def test_what_is_sent_to_a_worker_that_has_ended_is_not_kept() -> None:
+    """As the images for a workstation that is away for hours."""
+    worker = Worker("echo", f"{HERE}:echo", "a")
+    worker.kill()
+    worker._channel.join()
+    image = np.zeros(100_000)
+    kept = weakref.ref(image)
+    worker.send(image)
+    del image
+    assert kept() is None
 
 
 def test_a_worker_that_does_not_end_is_killed(caplog) -> None:
