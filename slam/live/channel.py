@@ -115,12 +115,14 @@ class Channel:
         self._shutdown(socket.SHUT_RDWR)
 
     def _send_all(self) -> None:
-        while (message := self._outbox.get()) is not END:
-            try:
+        try:
+            while (message := self._outbox.get()) is not END:
                 self._connection.send(self._pack(message))
-            except OSError:  # the other side has ended
-                self.open = False
-                return
+        except OSError:  # the other side has ended
+            self.open = False
+        except Exception:  # without this message, the other side would wait for ever
+            self.open = False
+            logger.exception("a message between processes cannot be sent")
         self._shutdown(socket.SHUT_WR)
 
     def _read_all(self) -> None:

@@ -130,6 +130,17 @@ def test_a_message_that_cannot_be_read_ends_the_worker(caplog) -> None:
     worker.stop()
 
 
+def test_a_message_that_cannot_be_sent_ends_the_worker(caplog) -> None:
+    worker = Worker("echo", f"{HERE}:echo", "a")
+    worker.send(1)
+    answers(worker, 1)
+    worker.send(lambda: 0)
+    assert has_ended(worker.pid, 30.0)
+    assert not worker.is_running
+    assert "a message between processes cannot be sent" in caplog.text and "lambda" in caplog.text
+    worker.stop()
+
+
 def test_a_killed_worker_is_detected_and_sending_is_safe() -> None:
     worker = Worker("echo", f"{HERE}:echo", "a")
     worker.send(1)
