@@ -87,7 +87,7 @@ class LostKeyframe:
 
 @dataclass(frozen=True)
 class Started:
-    """From the map: it has started to handle message ``number``."""
+    """From the map or the segmenter: it handles message, or segments keyframe, ``number``."""
 
     number: int
 

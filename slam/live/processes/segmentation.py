@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import os
 import time
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bmask_slam.datasets.weights import find_weights
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.channel import Channel
-from bmask_slam.live.messages import ImageToSegment, Masks, NotSegmented, Ready
+from bmask_slam.live.messages import ImageToSegment, Masks, NotSegmented, Ready, Started
 from bmask_slam.live.processes.supervision import DistantWorker, RestartPolicy, SupervisedWorker
 from bmask_slam.live.processes.worker import Workstation
 from bmask_slam.semantics.labels import LabelSet
@@ -28,6 +29,8 @@ MAX_WAITING = 4
 """Largest number of keyframes that wait for segmentation; the oldest are skipped."""
 MAX_KEPT = 100
 """The same for a workstation, which may go away and catches up when it is back."""
+MAX_IMAGE_CRASHES = 2
+"""An image at which so many processes have died is left out."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,7 @@ def serve_segmenter(
         stack = stack[-queueing.most :]
         if stack:
             image, started_s = stack.pop(-1 if queueing.newest_first else 0), time.perf_counter()
+            channel.send(Started(image.keyframe_id))
             try:
                 instances = segmenter.segment(image.rgb, image.name)
             except InputError as error:
@@ -97,6 +101,8 @@ class RemoteSegmenter:
         self.dropped = 0
         self.segmentation_ms: list[float] = []
         self._requested: dict[int, ImageToSegment] = {}
+        self._working = -1  # the last image that the process has begun with
+        self._crashes_at: Counter[int] = Counter()
         queueing = self.queueing if workstation is None else Queueing(MAX_KEPT)
         arguments, name = (options, sequence, upright or Upright(), queueing), "segmenter"
         self.worker: SupervisedWorker
@@ -145,19 +151,34 @@ class RemoteSegmenter:
             self._refuse_masks()
             messages = []
         for message in messages:
-            self._requested.pop(message.keyframe_id, None)
             match message:
+                case Started():
+                    self._working = message.number
                 case Masks():
+                    self._requested.pop(message.keyframe_id, None)
                     self.segmentation_ms.append(message.segmentation_ms)
                     found.append(message)
                 case NotSegmented():
-                    self._not_segmented(message)
-        if self.worker.restart_if_needed(busy=bool(self._requested)):
-            for image in self._requested.values():
-                self.worker.send(image)
+                    self._leave_out(message)
+        self._restart_if_needed()
+        return found
+
+    def _restart_if_needed(self) -> None:
+        """Send a new process what was requested, without an image at which two have died."""
+        crashes, begun = self.worker.crashes, self._working
+        is_new = self.worker.restart_if_needed(busy=bool(self._requested))
+        if self.worker.crashes > crashes and begun in self._requested:
+            self._crashes_at[begun] += 1
+            if self._crashes_at[begun] >= MAX_IMAGE_CRASHES:
+                self._leave_out(NotSegmented(begun, "the process crashed on it twice"))
+        for image in self._requested.values() if is_new else ():
+            self.worker.send(image)
         if self.worker.given_up:
             self._requested.clear()
-        return found
+
+    def _leave_out(self, message: NotSegmented) -> None:
+        self._requested.pop(message.keyframe_id, None)
+        self._not_segmented(message)
 
     def _refuse_masks(self) -> None:
         if not self.worker.given_up:

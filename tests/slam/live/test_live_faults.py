@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import signal
@@ -10,7 +11,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,17 +22,21 @@ from feeding import track_frames
 from synthetic_view import CAMERA, PlaneViews, sideways_path
 
 from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.live.channel import Channel
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.messages import ImageToSegment
 from bmask_slam.live.play import PlayOptions, play
-from bmask_slam.live.processes import supervision
+from bmask_slam.live.processes import segmentation, supervision
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
-from bmask_slam.live.processes.supervision import RestartPolicy
+from bmask_slam.live.processes.supervision import RestartPolicy, SupervisedWorker
 from bmask_slam.live.recorder import HEALTH_S
 from bmask_slam.live.sources.source import MeasuredSource, SourceCounts
 from bmask_slam.run_folder.reader import Run
+from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
@@ -160,6 +167,45 @@ def test_a_hanging_segmenter_is_restarted(tmp_path, monkeypatch) -> None:
     finally:
         segmenter.close()
     assert not running([first, segmenter.worker.pid])
+
+
+class Deadly:
+    """A segmenter that ends its process at one of the images."""
+
+    labels = LabelSet(("background",))
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        if name == "deadly":
+            time.sleep(0.2)  # as a network that works
+            os.kill(os.getpid(), signal.SIGKILL)
+        return []
+
+
+def serve_deadly(channel: Channel, *arguments: Any) -> None:
+    """``serve_segmenter`` with such a segmenter."""
+    segmentation.make_segmenter = lambda *_: Deadly()  # type: ignore[assignment]
+    segmentation.serve_segmenter(channel, *arguments)
+
+
+def test_an_image_that_kills_two_segmenters_is_left_out(tmp_path, monkeypatch, caplog) -> None:
+    def start(name: str, target: str, *rest: Any) -> SupervisedWorker:
+        return SupervisedWorker(name, f"{__name__}:serve_deadly", *rest)
+
+    caplog.set_level(logging.INFO)
+    monkeypatch.setattr(segmentation, "SupervisedWorker", start)
+    found: list[int] = []
+    with closing(RemoteSegmenter(label_image(tmp_path), tmp_path)) as segmenter:
+        for number, name in enumerate(("a", "deadly", "b")):
+            segmenter.request(ImageToSegment(number, FRAMES[0].rgb, name))
+
+        def step() -> bool:
+            found.extend(masks.keyframe_id for masks in segmenter.receive_masks())
+            return not segmenter.waiting
+
+        wait_until(step)
+        assert (sorted(found), segmenter.worker.crashes) == ([0, 2], 2)
+        assert (segmenter.dropped, segmenter.worker.given_up) == (1, False)
+    assert "keyframe 1 has no masks: the process crashed on it twice" in caplog.text
 
 
 def test_a_viewer_that_is_closed_changes_nothing(tmp_path, monkeypatch) -> None:

@@ -127,7 +127,7 @@ class SlowWorker(SimpleNamespace):
     """A segmenter's process whose masks have come when they were asked for three times."""
 
     def __init__(self, *_: object) -> None:
-        super().__init__(asked={}, seen=[], given_up=False, is_away=False, labels=())
+        super().__init__(asked={}, seen=[], crashes=0, given_up=False, is_away=False, labels=())
 
     def wait_until_ready(self) -> Ready:
         return Ready(("cup",))
