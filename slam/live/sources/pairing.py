@@ -6,12 +6,14 @@ import logging
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from bmask_slam.graph.trajectory import associate_stamps, nearest_indices
 from bmask_slam.live.sources.source import SourceCounts
+from bmask_slam.live.sources.source_clock import MAX_GAP_S
 from bmask_slam.sequences.lists import half_interval_s
 
 logger = logging.getLogger(__name__)
@@ -41,25 +43,37 @@ class Pair(NamedTuple, Generic[T]):
     lag_s: float
 
 
+@dataclass
+class _Stream:
+    """The last stamp of a stream, how often its clock was set back, and the mapped stamp.
+
+    ``before``: stamp and number of times before the last one, if that is far from it.
+    """
+
+    last_s: float = -np.inf
+    epoch: int = 0
+    placed_s: float = -np.inf
+    before: tuple[float, int] | None = None
+
+
 class StreamClock:
     """Maps the stamps of two streams to one clock that only goes forward.
 
     When the streams' clock is set back, the mapped clock goes on ``LATE_S`` after its latest stamp.
     Both streams get the same shift, each from its own first stamp after the clock was set back.
+    A single stamp that is wrong, as 0, changes nothing: the next one goes on from the one before.
     """
 
     def __init__(self, counts: SourceCounts) -> None:
         self._counts = counts
         self._shifts_s = [0.0]
-        self._epochs = [0, 0]
-        self._last_s = [-np.inf, -np.inf]
-        self._latest_s = -np.inf
+        self._streams = _Stream(), _Stream()
         self._begins_s = [-np.inf]
 
     @property
     def latest_s(self) -> float:
         """The latest mapped stamp."""
-        return self._latest_s
+        return max(stream.placed_s for stream in self._streams)
 
     @property
     def shift_s(self) -> float:
@@ -72,33 +86,53 @@ class StreamClock:
         return placed_s - self._shifts_s[epoch]
 
     def map_stamp(self, stream: int, stamp_s: float) -> float | None:
-        """The mapped stamp in seconds; None for a duplicate or late one, which is counted."""
-        last_s = self._last_s[stream]
-        if stamp_s == last_s:
+        """The mapped stamp in seconds; None for a duplicate or late one, which is counted.
+
+        It is earlier than the last one if that was wrong.
+        """
+        of = self._streams[stream]
+        if stamp_s == of.last_s:
             self._counts.duplicates += 1
             return None
-        if stamp_s < last_s - LATE_S:
-            self._set_back(stream, stamp_s)
-        elif stamp_s < last_s:
+        last, before = (of.last_s, of.epoch), of.before
+        if before is not None and _goes_on(before[0], of.last_s, stamp_s):
+            self._take_back(of, *before)
+        elif of.last_s - LATE_S <= stamp_s < of.last_s:
             self._counts.late += 1
             return None
-        self._last_s[stream] = stamp_s
-        placed_s = stamp_s + self._shifts_s[self._epochs[stream]]
-        self._latest_s = max(self._latest_s, placed_s)
-        return placed_s
+        else:
+            of.before = last if abs(stamp_s - of.last_s) > LATE_S else None
+            if stamp_s < of.last_s:
+                self._set_back(of, stamp_s)
+        of.last_s = stamp_s
+        of.placed_s = stamp_s + self._shifts_s[of.epoch]
+        return of.placed_s
 
-    def _set_back(self, stream: int, stamp_s: float) -> None:
-        self._epochs[stream] += 1
-        if self._epochs[stream] < len(self._shifts_s):
+    def _set_back(self, of: _Stream, stamp_s: float) -> None:
+        of.epoch += 1
+        if of.epoch < len(self._shifts_s):
             return
         self._counts.clock_jumps += 1
-        self._begins_s.append(self._latest_s + LATE_S / 2)
-        self._shifts_s.append(self._latest_s + LATE_S - stamp_s)
+        self._begins_s.append(self.latest_s + LATE_S / 2)
+        self._shifts_s.append(self.latest_s + LATE_S - stamp_s)
         logger.warning(
             "the clock was set back by %.3f s; stamps are shifted by %.3f s from here on",
-            self._last_s[stream] - stamp_s,
+            of.last_s - stamp_s,
             self._shifts_s[-1],
         )
+
+    def _take_back(self, of: _Stream, last_s: float, epoch: int) -> None:
+        """The last stamp of a stream was wrong; it goes on from the one before."""
+        logger.warning("the stamp %.3f was wrong: stamps go on from %.3f", of.last_s, last_s)
+        of.epoch, of.before = epoch, None
+        if max(stream.epoch for stream in self._streams) < len(self._shifts_s) - 1:
+            self._counts.clock_jumps -= 1
+            del self._shifts_s[-1], self._begins_s[-1]
+
+
+def _goes_on(before_s: float, last_s: float, stamp_s: float) -> bool:
+    """Whether a stamp follows the one before the last, and not the last one, which is far away."""
+    return 0 < stamp_s - before_s < min(abs(stamp_s - last_s), MAX_GAP_S)
 
 
 class GapMeter:
@@ -155,7 +189,9 @@ class Pairer(Generic[T]):
             return []
         self._move_depth(self._depth_offset_s())
         placed_s += self._offsets_s[stream]
-        if stream == DEPTH and np.isfinite(self._heard_s[DEPTH]):
+        if placed_s <= self._heard_s[stream]:  # the last stamp was wrong
+            self._leave_out(stream, placed_s)
+        elif stream == DEPTH and np.isfinite(self._heard_s[DEPTH]):
             self._steps_s.append(placed_s - self._heard_s[DEPTH])
             half_s = half_interval_s(np.array(self._steps_s)) if self._offsets_s[DEPTH] else 0.0
             self._max_s = max(self._least_s, half_s)
@@ -165,6 +201,19 @@ class Pairer(Generic[T]):
         for each in (RGB, DEPTH):
             self._discard(each)
         return pairs
+
+    def _leave_out(self, stream: int, from_s: float) -> None:
+        """Drop the images of a stream that wait and have this stamp or a later one."""
+        queue = self._waiting[stream]
+        while queue and queue[-1][0] >= from_s:
+            queue.pop()
+            self._count_unpaired(stream)
+
+    def _count_unpaired(self, stream: int) -> None:
+        if stream == RGB:
+            self._counts.unpaired_rgb += 1
+        else:
+            self._counts.unpaired_depth += 1
 
     def _move_depth(self, offset_s: float) -> None:
         """Place the depth images that wait by another offset, if it is another."""
@@ -220,7 +269,4 @@ class Pairer(Generic[T]):
             if not over and len(queue) <= self._max_waiting:
                 return
             queue.popleft()
-            if stream == RGB:
-                self._counts.unpaired_rgb += 1
-            else:
-                self._counts.unpaired_depth += 1
+            self._count_unpaired(stream)

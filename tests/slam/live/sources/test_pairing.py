@@ -131,6 +131,22 @@ def test_stamps_go_forward_after_the_clock_was_set_back(caplog) -> None:
     assert "set back by 60.9" in caplog.text
 
 
+@pytest.mark.parametrize("wrong_s", [0.0, 1e4 + 3600, 1e4 - 3600, 1e4 + 6.2, 1e4 - 1.8])
+@pytest.mark.parametrize("streams", [(RGB,), (DEPTH,), (RGB, DEPTH)])
+def test_one_wrong_stamp_costs_one_or_two_pairs(wrong_s: float, streams, caplog) -> None:
+    """Taken for a clock that was set back, it left the streams unpaired for ever."""
+    right_s, counts = 1e4 + np.arange(100) / 30, SourceCounts()
+    rgb_s, depth_s = right_s.copy(), right_s + 0.002
+    for stream in streams:
+        (rgb_s, depth_s)[stream][50] = wrong_s
+    pairs = pairs_of(rgb_s, depth_s, np.tile([RGB, DEPTH], 100), counts)
+    known = [pair for pair in pairs if pair.rgb != 50]
+    assert len(known) >= 98 and all(pair.rgb == pair.depth for pair in known)
+    assert [pair.stamp_s for pair in known] == right_s[[pair.rgb for pair in known]].tolist()
+    assert counts.clock_jumps == 0
+    assert f"the stamp {wrong_s:.3f} was wrong" in caplog.text
+
+
 def test_gaps_are_counted_relative_to_the_usual_step() -> None:
     counts = SourceCounts()
     stamps_s = np.cumsum([0, 0.1, 0.1, 0.25, 0.1, 0.5, 0.1, 60, 0.1])
