@@ -149,6 +149,7 @@ class Reduced(Wrapped):
 def paced(frames: Iterator[Frame]) -> Iterator[Frame]:
     """Each frame at the time that its stamp gives, relative to the first, which comes at once.
 
+    So does one after a long pause, and one with an earlier stamp than the one before.
     A frame is read in the second half of the interval before it is due, as a camera's driver would
     decode it, so that reading does not compete with the tracking of the frame before.
     """
@@ -160,7 +161,8 @@ def paced(frames: Iterator[Frame]) -> Iterator[Frame]:
         if frame is None:
             return
         now_s = time.monotonic()
-        if begin_s is None or begin_s + frame.timestamp_s - now_s > MAX_WAIT_S:
+        goes_back = frame.timestamp_s < last_s  # the last one was wrong
+        if begin_s is None or goes_back or begin_s + frame.timestamp_s - now_s > MAX_WAIT_S:
             begin_s = now_s - frame.timestamp_s
         else:
             interval_s = frame.timestamp_s - last_s

@@ -15,6 +15,7 @@ from faults import Clock, wait_until
 from synthetic_view import CAMERA, PlaneViews, render_plane
 
 from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.live.live_slam import LiveSlam
@@ -161,7 +162,8 @@ def test_silence_is_reported_once_and_frames_after_it_are_tracked(
     assert caplog.text.count("no frame for") == 1
 
 
-def test_a_recording_is_delivered_at_its_stamps(monkeypatch) -> None:
+def played(stamps_s: Array, monkeypatch: pytest.MonkeyPatch) -> tuple[list[float], list[float]]:
+    """When frames with these stamps are read, and when they are delivered."""
     now_s = 100.0
 
     def sleep(seconds: float) -> None:
@@ -170,16 +172,27 @@ def test_a_recording_is_delivered_at_its_stamps(monkeypatch) -> None:
 
     clock = SimpleNamespace(monotonic=lambda: now_s, sleep=sleep)
     monkeypatch.setattr("bmask_slam.live.sources.source.time", clock)
-    frames = [replace(FRAMES[k], timestamp_s=5.0 + 0.1 * k) for k in range(5)]
     read_s, delivered_s = [], []
 
     def reading() -> Iterator[Frame]:
-        for frame in frames:
+        for stamp_s in stamps_s.tolist():
             read_s.append(now_s)
-            yield frame
+            yield replace(FRAMES[0], timestamp_s=stamp_s)
 
     for _ in paced(reading()):
         delivered_s.append(now_s)
+    return read_s, delivered_s
+
+
+def test_a_wrong_stamp_does_not_hurry_the_frames_after_it(monkeypatch) -> None:
+    stamps_s = 5.0 + 0.1 * np.arange(9)
+    stamps_s[4] += 3600.0
+    delivered_s = played(stamps_s, monkeypatch)[1]
+    np.testing.assert_allclose(np.diff(delivered_s)[[0, 1, 2, 5, 6, 7]], 0.1)
+
+
+def test_a_recording_is_delivered_at_its_stamps(monkeypatch) -> None:
+    read_s, delivered_s = played(5.0 + 0.1 * np.arange(5), monkeypatch)
     due_s = delivered_s[0] + 0.1 * np.arange(5)
     np.testing.assert_allclose(delivered_s, due_s)
     np.testing.assert_allclose(read_s[2:], due_s[2:] - 0.05)  # then it knows the interval
