@@ -118,8 +118,10 @@ class Workstation:
 
         Raises:
             WorkstationAwayError: the workstation cannot be reached.
-            InputError: it has another token or version, or ``host`` is no name of one.
+            InputError: it has another token or version, ``host`` is no name of one, or the file
+                cannot be read.
         """
+        data = None if state is None else file_data(state)
         host = f"[{self.host}]" if ":" in self.host else self.host
         where = f"the workstation {host}:{self.port}"
         try:
@@ -135,7 +137,6 @@ class Workstation:
             reason = error.strerror or error
             raise WorkstationAwayError(f"{where} cannot be reached ({reason}); {CURE}") from error
         self.traffic.add(connection)
-        data = None if state is None else file_data(state)
         return DistantEnd(connection, (name, arguments, data))
 
 

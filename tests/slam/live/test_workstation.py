@@ -322,6 +322,13 @@ def test_connections_that_have_ended_keep_no_descriptor(cut) -> None:
     until(lambda: len(os.listdir("/proc/self/fd")) <= before)
 
 
+def test_no_connection_is_opened_for_a_state_that_is_gone(cut, tmp_path: Path) -> None:
+    there = workstation(cut)
+    with pytest.raises(InputError, match="no such file"):
+        there.worker("map", (), tmp_path / "state")
+    assert not there.traffic.connections
+
+
 # --- files ---------------------------------------------------------------------------------------
 
 
