@@ -49,8 +49,8 @@ from bmask_slam.world.frame_history import NO_KEYFRAME, Entries, FrameHistory
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
-SAVE_EVERY, SAVE_SHARE = 20, 0.05  # a state is the whole map
-"""Least interval of saved states in keyframes, and as a share of those of the map."""
+SAVE_EVERY, SAVE_SHARE, MAX_UNSAVED = 20, 0.05, 2000  # a state is the whole map
+"""Keyframes between saved states, least and as a share of the map's; most messages between them."""
 MAX_PENDING = 3
 """Largest number of keyframes that wait for the process; then no further one is accepted."""
 
@@ -90,7 +90,7 @@ class RemoteMapper:
         self.objects: MapObjects | None = None
         self.maps_saved: list[MapSaved] = []
         self.extends, self._asked = True, False
-        self._sent_frames = self._saved_keyframes = self._owned = 0
+        self._sent_frames = self._saved_keyframes = self._owned = self._unsaved = 0
         self._pending: set[int] = set()
         self.worker = MapWorker((camera, config, names), self._replacement, place)
 
@@ -136,21 +136,20 @@ class RemoteMapper:
         self.world.store_features(keyframe)
         self.places.add(keyframe.id, keyframe.features.descriptors)
         self._pending.add(keyframe.id)
-        self.send(
-            NewKeyframe(
-                keyframe.id,
-                frame.index,
-                frame.timestamp_s,
-                replace(tracked, new_ids=new_ids),
-                segment,
-                None if reference is None else (reference.id, reference.T_world_camera),
-                local_ids,
-                reserved,
-                counts,
-                self._unsent_history(),
-                kept_depth(frame.depth_m if self._has_labels else frame.depth_m[:0]),
-            )
+        made = NewKeyframe(
+            keyframe.id,
+            frame.index,
+            frame.timestamp_s,
+            replace(tracked, new_ids=new_ids),
+            segment,
+            None if reference is None else (reference.id, reference.T_world_camera),
+            local_ids,
+            reserved,
+            counts,
+            self._unsent_history(),
+            kept_depth(frame.depth_m if self._has_labels else frame.depth_m[:0]),
         )
+        self.send(made)
         return keyframe
 
     def add_measurements(self, new: Measurements) -> None:
@@ -185,6 +184,9 @@ class RemoteMapper:
     def send(self, message: Any) -> None:
         """Send a message, which is sent again to a new process if this one dies."""
         self.worker.send(message)
+        self._unsaved += 1
+        if self._unsaved == MAX_UNSAVED:
+            self.save_state()
 
     def ask_for_objects(self) -> None:
         """Let the process send its objects, unless it is asked already."""
@@ -194,6 +196,7 @@ class RemoteMapper:
 
     def save_state(self) -> None:
         """Let the process save its state, from which it can be started again."""
+        self._unsaved = 0
         self.send(SaveState(self._folder / ".live-state"))
 
     def catch_up(self, timeout_s: float = 0.0) -> list[Any]:

@@ -13,6 +13,7 @@ from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.files.array_file import read_arrays
 from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.graph.smoother.storage import read_camera
 from bmask_slam.live.messages import (
     STATE_FILE,
@@ -24,10 +25,14 @@ from bmask_slam.live.messages import (
     RestoreObservations,
     SaveState,
     Started,
+    StateSaved,
     UseCamera,
     VisibilityCounts,
 )
+from bmask_slam.live.processes import map_worker
 from bmask_slam.live.processes.map_process import MapServer
+from bmask_slam.live.processes.map_return import MapPlace
+from bmask_slam.live.processes.remote_mapper import MAX_UNSAVED, RemoteMapper
 from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
@@ -148,3 +153,34 @@ def test_a_state_that_cannot_be_written_is_done_without(tmp_path, caplog) -> Non
     server.handle(1, SaveState(path))
     assert answers == [Started(1), Handled(1)]
     assert str(path) in caplog.text
+
+
+class Saving:
+    """Stands in for the map's process: saves every state at once."""
+
+    is_running = True
+
+    def __init__(self, *_: object) -> None:
+        self._answers: list[Any] = []
+
+    def send(self, numbered: tuple[int, Any]) -> None:
+        number, message = numbered
+        if isinstance(message, SaveState):
+            self._answers.append(StateSaved(number, message.path))
+
+    def receive(self, timeout_s: float = 0.0) -> list[Any]:
+        found, self._answers = self._answers, []
+        return found
+
+
+def test_measurements_of_a_robot_that_stands_still_do_not_pile_up(tmp_path, monkeypatch) -> None:
+    """Without keyframes too; a process that is started again would get all of them."""
+    monkeypatch.setattr(map_worker, "Worker", Saving)
+    config = resolve(SystemConfig, None, ("sensors.imu.enabled=true",))
+    mapper = RemoteMapper(CAMERA, config, ("background",), MapPlace(tmp_path))
+    for number in range(2 * MAX_UNSAVED + 10):
+        mapper.add_measurements(Measurements("imu", np.full((1, 7), number / 30)))
+        mapper.catch_up()
+    assert mapper.worker.saves == 2
+    assert not mapper.worker.lacks(0, mapper.worker.saved)
+    assert mapper.worker.lacks(mapper.worker.saved, mapper.worker.sent)
