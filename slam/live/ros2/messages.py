@@ -43,12 +43,18 @@ def header(stamp_s: float, frame: str) -> Any:
     return message("Header", message("Time", seconds, nanoseconds), frame)
 
 
+def poses(T: Array) -> list[Any]:
+    """A geometry_msgs/Pose of each pose (N, 4, 4)."""
+    quaternions = quaternion_from_rotation(T[:, :3, :3]).tolist()
+    return [
+        message("Pose", message("Point", *place), message("Quaternion", *turn))
+        for place, turn in zip(T[:, :3, 3].tolist(), quaternions, strict=True)
+    ]
+
+
 def pose(T: Array) -> Any:
     """A geometry_msgs/Pose."""
-    x, y, z, w = map(float, quaternion_from_rotation(T[:3, :3]))
-    return message(
-        "Pose", message("Point", *map(float, T[:3, 3])), message("Quaternion", x, y, z, w)
-    )
+    return poses(T[None])[0]
 
 
 def transform(stamp_s: float, frames: tuple[str, str], T: Array) -> Any:

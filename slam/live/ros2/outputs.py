@@ -18,6 +18,7 @@ from bmask_slam.live.ros2.messages import (
     occupancy_grid,
     point_cloud,
     pose,
+    poses,
     ros_covariance,
     ros_twist,
     transform,
@@ -176,8 +177,9 @@ class Ros2Outputs:
 
     def map(self, stamp_s: float, path_world: Array, points_world: Array, colours: Bytes) -> None:
         """Publish keyframe poses (K, 4, 4) and landmarks (N, 3) with colours (N, 3)."""
-        f, poses = self._frames, self._T_map_world @ path_world @ self._T_camera_base
-        stamped = [message("PoseStamped", header(stamp_s, f.map), pose(T)) for T in poses]
+        f, path_map = self._frames, self._T_map_world @ path_world @ self._T_camera_base
+        top = header(stamp_s, f.map)
+        stamped = [message("PoseStamped", top, where) for where in poses(path_map)]
         self._path.send(message("Path", header(stamp_s, f.map), stamped))
         R, t = self._T_map_world[:3, :3], self._T_map_world[:3, 3]
         self._landmarks.send(point_cloud(stamp_s, f.map, points_world @ R.T + t, colours))
