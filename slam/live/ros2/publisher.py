@@ -28,6 +28,8 @@ PERIOD_S, OBJECTS_S, GRID_S = 1.0, 3.0, 5.0
 """Between two messages with path, landmarks and health; with objects; with grid and cloud."""
 GRID_SHARE = 0.1
 """Of a processor that grid and cloud may take: they are made less often if it takes longer."""
+MAP_SHARE = 0.05
+"""Of the time that path and landmarks may take, beside tracking: in a long run they take longer."""
 NICENESS = 15
 MAX_POSES, MAX_POINTS = 1000, 20_000
 """Of the path, and of landmarks, those seen most often, in a message."""
@@ -81,8 +83,13 @@ class Ros2Publisher:
         self._outputs.frame(result, known=result.segment == self._segment)
         self._last_s = result.timestamp_s
         stamp_s = self._ros_time(self._last_s)
+        if self._is_due("health", PERIOD_S):
+            self._publish_health(stamp_s, run)
         if self._is_due("map", PERIOD_S):
+            begin_s = time.monotonic()
             self._publish_map(stamp_s, run)
+            took_s = time.monotonic() - begin_s
+            self._due_s["map"] = begin_s + max(PERIOD_S, took_s / MAP_SHARE)
         if self._is_due("objects", OBJECTS_S):
             self._publish_objects(stamp_s, run)
         if self._is_due("grid", GRID_S):
@@ -93,6 +100,7 @@ class Ros2Publisher:
         if run is not self._run:  # it has tracked nothing
             return
         stamp_s = self._ros_time(self._last_s)
+        self._publish_health(stamp_s, run)
         self._publish_map(stamp_s, run)
         self._publish_objects(stamp_s, run)
         wait([self._making] if self._making else [])
@@ -101,7 +109,7 @@ class Ros2Publisher:
     def _begin(self) -> None:
         """Nothing is known of a run's map yet, and everything is due."""
         self._segment = 0
-        self._due_s = {"map": 0.0, "objects": 0.0, "grid": 0.0}
+        self._due_s = {"health": 0.0, "map": 0.0, "objects": 0.0, "grid": 0.0}
         self._grid = LiveGrid(self._T_map_world, self._grid_options)
         self._cloud = LiveCloud(self._T_map_world, self._voxel_m)
 
@@ -142,6 +150,8 @@ class Ros2Publisher:
         path = path[:: len(path) // MAX_POSES + 1]
         best = np.argsort(-cloud.observations, kind="stable")[:MAX_POINTS]
         self._outputs.map(stamp_s, path, cloud.points_world[best], cloud.colours[best])
+
+    def _publish_health(self, stamp_s: float, run: LiveRun) -> None:
         health = asdict(run.health())
         counts = health.pop("source")
         self._outputs.health(stamp_s, health | counts)

@@ -220,6 +220,26 @@ def test_maps_are_published_when_they_are_due(monkeypatch) -> None:
         assert len(node.topics[name]) == counts[name] + 1
 
 
+def test_a_path_that_takes_long_is_published_less_often(monkeypatch) -> None:
+    """After an hour, that of all frames takes longer than the interval of two images."""
+    clock = SimpleNamespace(monotonic=lambda: clock.now_s, thread_time=lambda: 0.0, now_s=100.0)
+    monkeypatch.setattr(publisher, "time", clock)
+    node, run = StandIn(), Run()
+
+    def trajectory() -> Trajectory:
+        clock.now_s += 0.2
+        return Trajectory(np.ones(1), np.eye(4)[None])
+
+    run.trajectory = trajectory  # type: ignore[method-assign]
+    publish = Ros2Publisher(node, Ros2Frames(), Robot(T_MAP_WORLD, True))
+    for k in range(120):
+        publish(FrameResult(k, 5 + k / 10, TrackingStatus.OK, np.eye(4), 0), run)
+        clock.now_s += 0.1
+    counts = {topic: len(sent) for topic, sent in node.topics.items()}
+    assert counts["/bmask_slam/path"] == counts["/bmask_slam/landmarks"] == 4
+    assert counts["/diagnostics"] >= 11
+
+
 def test_what_is_published_last_is_of_the_map_at_the_end() -> None:
     node, run = StandIn(), Run()
     publish = Ros2Publisher(node, Ros2Frames(), Robot(T_MAP_WORLD, True))
