@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, wait
 from dataclasses import asdict, dataclass
 from itertools import islice
 from typing import Generic, Protocol, TypeVar
@@ -178,6 +178,8 @@ def _sleep_until(time_s: float) -> None:
 class Newest(Generic[T]):
     """Reads an iterator in a thread and queues a few items; one too many drops all older ones.
 
+    The thread is a daemon: a driver that does not return from a call does not keep the program.
+
     A short stall of the consumer costs no item, and a long one adds no more delay than the queue
     holds.
 
@@ -191,9 +193,9 @@ class Newest(Generic[T]):
         self._kept: list[T] = []
         self._stopped = False
         self._changed = threading.Condition()
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="source")
-        self._end = self._thread.submit(self._read_all)
+        self._end: Future[None] = Future()
         self._end.add_done_callback(lambda _: self._notify())
+        threading.Thread(target=self._read_all, name="source", daemon=True).start()
 
     def get(self, timeout_s: float) -> T | None:
         """The oldest item in the queue; None if none comes in that time, or at the end.
@@ -218,19 +220,26 @@ class Newest(Generic[T]):
     def stop(self, wait_s: float = 0.0) -> None:
         """Read no further item; waits so long for one that is being read."""
         self._stopped = True
-        self._thread.shutdown(wait=False)
         wait([self._end], wait_s)
 
     def _read_all(self) -> None:
-        for item in self._items:
-            if self._stopped:
-                return
-            with self._changed:
-                self._kept.append(item)
-                if len(self._kept) > self._keep:
-                    self.dropped += len(self._kept) - 1
-                    del self._kept[:-1]
-                self._changed.notify()
+        try:
+            for item in self._items:
+                if self._stopped:
+                    break
+                self._keep_newest(item)
+        except BaseException as error:  # noqa: BLE001 - ``get`` raises it
+            self._end.set_exception(error)
+        else:
+            self._end.set_result(None)
+
+    def _keep_newest(self, item: T) -> None:
+        with self._changed:
+            self._kept.append(item)
+            if len(self._kept) > self._keep:
+                self.dropped += len(self._kept) - 1
+                del self._kept[:-1]
+            self._changed.notify()
 
     def _notify(self) -> None:
         with self._changed:

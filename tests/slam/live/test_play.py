@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -105,6 +107,26 @@ def test_an_endless_source_stops_on_request() -> None:
     while not newest.ended and time.monotonic() < deadline_s:
         newest.get(0.01)
     assert newest.ended
+
+
+BLOCKED = """
+import time
+from bmask_slam.live.sources.source import Newest
+
+def frames():
+    yield 1
+    time.sleep(600)
+
+newest = Newest(frames(), 3)
+print(newest.get(60))
+newest.stop()
+"""
+
+
+def test_a_driver_that_does_not_return_does_not_keep_the_program() -> None:
+    command = [sys.executable, "-c", BLOCKED]
+    done = subprocess.run(command, check=True, capture_output=True, timeout=60)
+    assert (done.stdout, done.stderr) == (b"1\n", b"")
 
 
 @pytest.fixture(scope="module")
