@@ -39,9 +39,9 @@ from bmask_slam.sensing.marker_sightings import (
     Verdict,
     chosen,
     drift_path,
-    has,
     markers_in,
     of_keyframes,
+    place_of,
     sightings_of,
     spread,
 )
@@ -73,6 +73,7 @@ class MarkerFusion:
         self.config = config
         self.waiting: list[Sighting] = []
         self.sizes: dict[int, tuple[float, float]] = {}
+        self._refused: dict[RelativePoseName, tuple[float, float]] = {}  # size; of unknown markers
         self._events = events
 
     def changes(
@@ -86,25 +87,27 @@ class MarkerFusion:
         if not self.config.enabled:
             return SensorChanges()
         rows, factors = streams.of("markers"), []
-        begun: dict[int, Array] = {}
+        begun, places = dict[int, Array](), dict[int, Array | None]()
         self.waiting = [s for s in self.waiting if s.factor.keyframe_b in sight.world.keyframes]
         for keyframe, row in of_keyframes(keyframes, rows):
             key = marker_id(segment, int(row[1]))
             name = (key, keyframe.id, MARKER)
-            waits = any(s.factor.name == name for s in self.waiting)
-            if (name in sight.made and (key in begun or has(sight.tables, key))) or waits:
+            if key not in places:
+                places[key] = place_of(sight.tables, key)
+            T_known, size = places[key], self.size_of(int(row[1]))
+            is_done = T_known is not None or self._refused.get(name) == size
+            if (name in sight.made and is_done) or any(s.factor.name == name for s in self.waiting):
                 continue
-            T_known = begun.get(key)
-            if T_known is None and has(sight.tables, key):
-                (T_known,) = sight.tables.keyframes.get(np.array([key]))
             seen = self._sighting(name, SeenCorners.of(row[2:]), keyframe, T_known)
             found = self._verdict(seen, sight) if isinstance(seen, Sighting) else seen
             if found is None:
                 continue
             sight.made[name] = float(found) if isinstance(found, Verdict) else np.nan
+            if isinstance(found, Verdict) and T_known is None:
+                self._refused[name] = size
             if isinstance(found, Sighting):
                 if T_known is None:
-                    begun[key] = keyframe.T_world_camera @ inverse(found.factor.T_a_b)
+                    begun[key] = places[key] = keyframe.T_world_camera @ inverse(found.factor.T_a_b)
                 factors.append(found.factor)
                 self._add_size(found)
         new = SensorChanges(
@@ -202,15 +205,14 @@ class MarkerFusion:
     def _site(self, segment: int, begun: Mapping[int, Array], sight: MarkerSight) -> SensorChanges:
         """The known poses of markers, in the frame of the site, which begins with the first."""
         site, factors, poses = site_id(segment), [], dict(begun)
-        known = sight.tables.keyframes
-        T_world_site = known.get(np.array([site]))[0] if has(sight.tables, site) else None
+        T_world_site = place_of(sight.tables, site)
         begins = T_world_site is None
         covariance = diagonal_covariance(self.config.sigma_rad, self.config.sigma_m)
         for row in self.config.poses:
             key, T_site_marker = marker_id(segment, row[0]), T_of(row[1:])
             name = (site, key, SITE)
-            if key not in poses and has(sight.tables, key):
-                poses[key] = known.get(np.array([key]))[0]
+            if key not in poses and (T := place_of(sight.tables, key)) is not None:
+                poses[key] = T
             if key not in poses or (name in sight.made and not begins):
                 continue
             if T_world_site is None:
@@ -238,9 +240,8 @@ class MarkerFusion:
                 counts = sightings.get(key, {})
                 seen = used + sum(n for what, n in counts.items() if what != "used")
                 found.append(FoundMarker(number, size_m, T, seen, used))
-        site, known = np.array([site_id(segment)]), tables.keyframes
-        T_world_site = known.get(site)[0] if has(tables, site_id(segment)) else None
-        return MarkerMap(self.config.dictionary, T_world_site, tuple(found))
+        site = place_of(tables, site_id(segment))
+        return MarkerMap(self.config.dictionary, site, tuple(found))
 
     def report(self, sightings: Mapping[int, Mapping[str, int]]) -> None:
         """Tell and count how many markers were seen, and what became of their sightings."""

@@ -110,6 +110,11 @@ def has(tables: FactorTables, key: int) -> bool:
     return bool(tables.keyframes.contains(np.array([key])).all())
 
 
+def place_of(tables: FactorTables, key: int) -> Array | None:
+    """The estimate (4, 4) of a pose, None where the graph has none."""
+    return tables.keyframes.get(np.array([key]))[0] if has(tables, key) else None
+
+
 def of_keyframes(keyframes: Sequence[Keyframe], rows: Array) -> Iterator[tuple[Keyframe, Array]]:
     """The rows of each keyframe's stamp."""
     stamps_s = np.array([k.timestamp_s for k in keyframes])

@@ -14,6 +14,7 @@ from bmask_slam.back_end.landmark_management import MappingConfig
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.back_end.marker_loops import join_by_markers
 from bmask_slam.events import EventKind
+from bmask_slam.features.marker_detection import possible_poses
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_update import MARKER, SITE, marker_id, marker_of, site_id
 from bmask_slam.graph.geometry import (
@@ -24,8 +25,9 @@ from bmask_slam.graph.geometry import (
     se3_log,
 )
 from bmask_slam.graph.sensors.config import SensorsConfig
-from bmask_slam.graph.sensors.markers import CORNERS, MarkersConfig
+from bmask_slam.graph.sensors.markers import CORNERS, MarkerPose, MarkersConfig, SeenCorners
 from bmask_slam.graph.sensors.streams import Measurements
+from bmask_slam.sensing import marker_fusion
 from bmask_slam.sensing.marker_sightings import WORDS, MarkerSight, Verdict, drift_path
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 
@@ -250,6 +252,25 @@ def test_known_poses_give_the_frame_of_a_site() -> None:
     assert np.abs(error[:3]).max() < 0.01
     assert np.abs(error[3:]).max() < 0.06  # five metres away
     assert tables.keyframes.contains(np.array([site_id(0)])).all()
+
+
+def test_a_marker_too_far_to_tell_its_pose_is_looked_at_once_a_keyframe(monkeypatch) -> None:
+    """Those of all keyframes were looked at again with each, 4 ms each."""
+    looked: list[SeenCorners] = []
+
+    def possible(seen: SeenCorners, *size: float) -> list[MarkerPose]:
+        looked.append(seen)
+        return possible_poses(seen, *size)
+
+    monkeypatch.setattr(marker_fusion, "possible_poses", possible)
+    far, walk = {7: make_pose(np.diag([1.0, -1.0, -1.0]), np.array([0.1, 0.0, 14.0]))}, Walk()
+    for k in range(8):
+        walk.step(pose(k / 5), far)
+    (counts,) = walk.mapper.sensors.sightings().values()
+    assert counts == {WORDS[Verdict.AMBIGUOUS]: 8}
+    assert len(looked) == 8
+    walk.step(pose(2), PLACES | {7: make_pose(far[7][:3, :3], np.array([0.1, 0.0, 1.2]))})
+    assert walk.mapper.sensors.sightings()[marker_id(0, 7)]["used"] == 1
 
 
 def test_sizes_that_are_not_known_are_measured() -> None:
