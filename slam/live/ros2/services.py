@@ -66,6 +66,7 @@ class Ros2Services:
         if self._saving:
             self._answer_saved(run)
         if self._later and not self._saving:
+            run.saved_maps()  # answers that came too late are none of this call
             run.save_map(self._later[0].path)
             self._saving, self._later = self._later, []
         self._resetting += self._reset.take()

@@ -135,6 +135,19 @@ def test_a_map_is_saved_or_it_is_said_why_not(monkeypatch) -> None:
     assert calls[4].answers == [(False, "the run ended before its map was saved")]
 
 
+def test_an_answer_that_came_too_late_is_none_of_the_next_call() -> None:
+    """Also one that a process which was started again has given a second time."""
+    ros, run = node(), Served(saved=[MapSaved(Path("/run/map"))])
+    services, call = Ros2Services(ros, "/x"), Call(TRIGGER(0))
+    ros.calls["save_map"] += [call]
+    services.serve(run)
+    services.serve(run)
+    assert (run.path, call.answers) == (Path("/run/map"), [])
+    run.saved = [MapSaved(Path("/run/map"), "the disk is full")]
+    services.serve(run)
+    assert call.answers == [(False, "the disk is full")]
+
+
 def test_many_calls_save_few_maps() -> None:
     """The map's process is kept busy by nobody; each answer is of a map saved after its call."""
     ros, run, asked = node(), Served(), []  # type: ignore[var-annotated]
