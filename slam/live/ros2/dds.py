@@ -47,6 +47,11 @@ def ros_name(name: str) -> str:
     return "/".join((*parts[:2], parts[3].removesuffix("_")))
 
 
+def rooted(name: str) -> str:
+    """The name of a topic or service with a slash before it, as ROS resolves one without."""
+    return f"/{name.lstrip('/')}"
+
+
 @cache
 def idl_struct(name: str) -> Any:
     """The struct of a message type as cyclonedds knows it, with a field for each of the message."""
@@ -223,15 +228,16 @@ class DdsNode:
 
     def writer(self, topic: str, name: str, quality: Quality = STATE) -> DdsWriter:
         """A publisher of messages of the type ``name``, such as sensor_msgs/msg/Image."""
-        return self._writer(f"rt{topic}", name, self._qos(quality))
+        return self._writer(f"rt{rooted(topic)}", name, self._qos(quality))
 
     def reader(self, topic: str, name: str, quality: Quality = SENSOR) -> DdsReader:
         """A subscription; one of best effort hears reliable publishers too."""
-        return self._reader(f"rt{topic}", name, self._qos(quality))
+        return self._reader(f"rt{rooted(topic)}", name, self._qos(quality))
 
     def service(self, service: str, name: str, calls: bool = False) -> DdsService:
         """Serve a service, or with ``calls`` be a client of it."""
-        ends = (f"rq{service}Request", f"{name}_Request"), (f"rr{service}Reply", f"{name}_Response")
+        path = rooted(service)
+        ends = (f"rq{path}Request", f"{name}_Request"), (f"rr{path}Reply", f"{name}_Response")
         (topic, received), (back, sent) = ends[::-1] if calls else ends
         role = "clientid" if calls else "serviceid"
         number = ".".join(f"{byte:x}" for byte in os.urandom(12))  # by which ROS finds the pair

@@ -143,6 +143,19 @@ def test_images_are_taken_of_best_effort_as_ros_sends_them(sent: Quality, monkey
     assert heard[0].header.stamp.sec == 12
 
 
+def test_names_without_a_slash_are_those_of_ros(monkeypatch) -> None:
+    """As of a ``prefix`` without one; ROS would not see a DDS topic rtrobot/path."""
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    robot, listener = DdsNode(DOMAIN + 2), DdsNode(DOMAIN + 2)
+    writers = [robot.writer(name, "nav_msgs/msg/Path") for name in ("robot/path", "/other/path")]
+    end_s, seen = time.monotonic() + 60, {}
+    while not {"/robot/path", "/other/path"} <= seen.keys() and time.monotonic() < end_s:
+        time.sleep(0.02)
+        seen = listener.published()
+    assert seen["/robot/path"] == seen["/other/path"] == "nav_msgs/msg/Path"
+    assert len(writers) == 2  # they have been there all the time
+
+
 def test_compressed_images_become_frames(monkeypatch) -> None:
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
     player, ended = Player(DdsNode(DOMAIN + 5), compressed=True), threading.Event()
