@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -130,6 +131,8 @@ def frames_a_second(most: float) -> FrameOptions:
     """At most so many frames for the dense map's surface. Raises InputError: it is negative."""
     from bmask_slam.dense.growing.frames import FrameOptions  # noqa: PLC0415 - loads torch
 
+    if not 0 <= most < math.inf:
+        raise InputError(f"--map-frames {most:g}: must be 0 or more frames a second")
     return FrameOptions(most)
 
 

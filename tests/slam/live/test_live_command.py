@@ -50,6 +50,13 @@ def test_masks_from_another_process_label_the_map(slow_office, tmp_path, capsys)
     assert json.loads((out / "objects.json").read_text())["objects"]
 
 
+@pytest.mark.parametrize("most", ["-1", "nan", "inf"])
+def test_a_number_of_frames_that_is_none_is_named_as_it_was_given(office, most, capsys) -> None:
+    assert main(["live", str(office), "--map", "--map-frames", most]) == 1
+    said = capsys.readouterr().err
+    assert f"error: --map-frames {most}: must be 0 or more frames a second" in said
+
+
 def test_a_live_dense_map_equals_the_offline_one_and_can_be_continued(
     slow_office, tmp_path, capsys
 ) -> None:
