@@ -27,6 +27,9 @@ logger = logging.getLogger(__name__)
 LEAST_SHARE, SLOWEST = 0.002, 30.0
 """A process that works gets at least this share of a processor on a busy machine, where it may
 take so many times as long."""
+DISTANT_S = 120.0
+"""``RestartPolicy.answer_s`` of a process on a workstation, of which nobody here knows how busy it
+is; whether that machine is there at all is seen by its connection."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +189,7 @@ class DistantWorker(SupervisedWorker):
         self._workstation = workstation
         self._back: queue.SimpleQueue[WorkerEnd] = queue.SimpleQueue()
         self._closed, self.is_away = threading.Event(), False
-        super().__init__(name, "", arguments, RestartPolicy())
+        super().__init__(name, "", arguments, RestartPolicy(answer_s=DISTANT_S))
 
     def restart_if_needed(self, busy: bool) -> bool:
         """Whether it has been begun again; waits for nothing."""

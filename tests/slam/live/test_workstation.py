@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from faults import Clock
 from feeding import track_frames
 from synthetic_view import CAMERA
 from test_live_faults import CONFIG, FRAMES, label_image
@@ -560,6 +561,30 @@ def test_masks_of_other_classes_are_not_used(machines, tmp_path: Path, caplog) -
             assert len(segmenter.receive_masks()) == (not others)
             assert segmenter.worker.given_up == bool(others) != there.is_running
             assert (segmenter.waiting, "has other classes" in caplog.text) == (0, bool(others))
+
+
+def test_a_slow_segmenter_of_a_workstation_is_not_lost(machines, monkeypatch, tmp_path) -> None:
+    """A large network may need half a minute for an image, as nobody here can see."""
+    clock = Clock()
+    monkeypatch.setattr(supervision, "time", clock)
+    start = End.__init__
+
+    def ready(end: End, *given: Any) -> None:
+        start(end, *given)
+        end.answers.append(Ready(("cup",)))
+
+    monkeypatch.setattr(End, "__init__", ready)
+    options = SegmenterOptions("mask-scoring-rcnn", weights="some.pth")
+    with closing(RemoteSegmenter(options, tmp_path, workstation=machines)) as segmenter:
+        segmenter.request(ImageToSegment(0, np.zeros((4, 4, 3), np.uint8), "a.png"))
+        clock.pass_s(60.0)
+        assert not segmenter.receive_masks() and not segmenter.worker.is_away
+        machines.there[0].answers.append(Masks(0, [], 6e4))
+        assert [masks.keyframe_id for masks in segmenter.receive_masks()] == [0]
+        segmenter.request(ImageToSegment(1, np.zeros((4, 4, 3), np.uint8), "b.png"))
+        clock.pass_s(supervision.DISTANT_S + 1.0)
+        segmenter.receive_masks()
+        assert (segmenter.worker.crashes, segmenter.worker.is_away) == (0, True)
 
 
 # --- with processes ------------------------------------------------------------------------------
