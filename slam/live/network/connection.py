@@ -23,7 +23,7 @@ from bmask_slam import __version__
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import read_bytes
 
-PROTOCOL = 3
+PROTOCOL = 4
 HELLO_BYTES, NONCE_BYTES, CODE_BYTES = 64, 32, 32
 MIN_TOKEN, MAX_TOKEN = 20, 4096
 MAX_PARTS = 1 << 16
