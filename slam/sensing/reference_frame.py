@@ -210,11 +210,12 @@ class ReferenceFrame:
         """Average the force around a keyframe once the frames around it are known, or the last."""
         config, t_s = self.config.accelerometer, keyframe.timestamp_s
         ends_s = t_s - config.average_s / 2, t_s + config.average_s / 2
-        path = self.history.path(self.world, self.segment, *ends_s)
-        known_until_s = path.timestamps_s[-1] if len(path) else -np.inf
         rows = self.streams.within("accelerometer", *ends_s)
-        known_s = min(known_until_s, rows[-1, 0]) if len(rows) else -np.inf
-        if not (known_s >= ends_s[1] - SLACK_S or (self.last and len(rows))):
+        if not len(rows):
+            return
+        path = self.history.path(self.world, self.segment, *ends_s)
+        known_s = min(path.timestamps_s[-1], rows[-1, 0]) if len(path) else -np.inf
+        if not (known_s >= ends_s[1] - SLACK_S or self.last):
             return
         poses, inside = path.at(rows[:, 0], MAX_GAP_S)
         R = keyframe.T_world_camera[:3, :3].T @ poses[inside, :3, :3]

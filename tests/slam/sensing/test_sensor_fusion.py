@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +19,12 @@ from bmask_slam.graph.factors.graph_update import GRAVITY, reference_frame_id
 from bmask_slam.graph.files.array_file import read_arrays, write_arrays
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, se3_log, so3_exp
 from bmask_slam.graph.sensors.mounting import T_of
+from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.run_folder.map_file import MAP_FILE
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import TrackingStatus
+from bmask_slam.world.frame_history import FrameHistory
 
 MOUNTING = (0.1, 0.0, 0.4, 0.5, -0.5, 0.5, -0.5)
 LEVER = (0.05, -0.2, 0.02)
@@ -193,6 +196,22 @@ def test_measurements_that_come_too_late_one_by_one_are_told_twice() -> None:
     assert "1 measurements up to -1.000 s refused" in told[0]
     system.finish()
     assert "odometry: 20 measurements came too late" in [e.text for e in system.events.take()]
+
+
+def test_keyframes_that_no_force_was_measured_at_take_no_time(monkeypatch) -> None:
+    """An accelerometer that begins late: the frames around all before were put together again."""
+    asked: list[float] = []
+    path = FrameHistory.path
+
+    def counted(history: FrameHistory, *about: Any) -> Trajectory:
+        asked.append(about[-1])
+        return path(history, *about)
+
+    monkeypatch.setattr(FrameHistory, "path", counted)
+    system = SlamSystem(CAMERA, CONFIG)
+    system.add_accelerometer(STAMPS_S + 9.0, forces()[1])
+    dark_run(system, 6)
+    assert len(system.mapper.world.keyframes) > 3 and not asked
 
 
 def test_a_second_recordings_measurements_are_of_its_own_keyframes() -> None:
