@@ -49,10 +49,11 @@ def inertial_update(
     """
     if not config.enabled or not len(streams.of("imu")):
         return InertialUpdate()
-    links = []
+    links, model = [], config.model
+    numbers = model.numbers
     for a, b in pairwise(keyframes):
-        factor, model = tables.factors.get((a.id, b.id)), config.model
-        known = factor is not None and np.array_equal(factor.model.numbers, model.numbers)
+        factor = tables.factors.get((a.id, b.id))
+        known = factor is not None and np.array_equal(factor.model.numbers, numbers)
         if not known and b.timestamp_s - a.timestamp_s <= config.max_apart_s:
             readings = readings_between(streams, a.timestamp_s, b.timestamp_s, config)
             if readings is not None:
@@ -73,7 +74,6 @@ def inertial_update(
         down = {segment: found.down}
         states = {k.id: state for k, state in zip(ends, found.states, strict=True)}
     states |= _restarts(links, tables, states)
-    model = config.model
     factors = [InertialFactor(k.a.id, k.b.id, segment, k.readings, model) for k in links]
     return InertialUpdate(tuple(factors), states=states, down=down)
 

@@ -15,9 +15,12 @@ from bmask_slam.events import Event, EventKind
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_update import GraphUpdate
 from bmask_slam.graph.geometry import inverse, make_pose, se3_log, so3_exp
+from bmask_slam.graph.inertial.tables import ImuModel
+from bmask_slam.graph.sensors.imu import ImuConfig
 from bmask_slam.graph.sensors.mounting import T_of
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.rendering.sensors import imu
+from bmask_slam.sensing.inertial_fusion import inertial_update
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
@@ -214,3 +217,21 @@ def test_a_mounting_that_is_not_given_is_estimated_and_used() -> None:
     names = [name for name in inertial.slots if name[0] == "imu"]
     assert sorted(name[1:] for name in names) == sorted(inertial.factors)
     assert not [name for name in inertial.slots if name[0] == "replaced"]
+
+
+def test_the_mounting_is_put_together_once_for_all_keyframes(monkeypatch) -> None:
+    """For each pair of keyframes it took 100 ms a keyframe in a map of 2000."""
+    made: list[ImuModel] = []
+    of = ImuConfig.model.fget
+
+    def counted(config: ImuConfig) -> ImuModel:
+        made.append(of(config))
+        return made[-1]
+
+    system = with_imu(readings())
+    run(system, range(12))
+    keyframes = list(system.mapper.world.keyframes.values())
+    tables, streams = system.mapper.smoother.tables.inertial, system.mapper.sensors.streams
+    monkeypatch.setattr(ImuConfig, "model", property(counted))
+    assert not inertial_update(keyframes, tables, streams, CONFIG.sensors.imu)
+    assert len(keyframes) > 8 and len(made) == 1
