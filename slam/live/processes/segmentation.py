@@ -168,6 +168,7 @@ class RemoteSegmenter:
         crashes, begun = self.worker.crashes, self._working
         is_new = self.worker.restart_if_needed(busy=bool(self._requested))
         if self.worker.crashes > crashes and begun in self._requested:
+            self._working = -1  # of the next process
             self._crashes_at[begun] += 1
             if self._crashes_at[begun] >= MAX_IMAGE_CRASHES:
                 self._leave_out(NotSegmented(begun, "the process crashed on it twice"))

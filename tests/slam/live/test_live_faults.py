@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
-from bmask_slam.live.messages import ImageToSegment
+from bmask_slam.live.messages import ImageToSegment, Started
 from bmask_slam.live.play import PlayOptions, play
 from bmask_slam.live.processes import segmentation, supervision
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
@@ -206,6 +207,28 @@ def test_an_image_that_kills_two_segmenters_is_left_out(tmp_path, monkeypatch, c
         assert (sorted(found), segmenter.worker.crashes) == ([0, 2], 2)
         assert (segmenter.dropped, segmenter.worker.given_up) == (1, False)
     assert "keyframe 1 has no masks: the process crashed on it twice" in caplog.text
+
+
+def test_a_process_that_dies_before_it_begins_blames_no_image(tmp_path, monkeypatch) -> None:
+    worker = SimpleNamespace(crashes=0, given_up=False, labels=(), answers=[Started(7)])
+    worker.receive = lambda: [worker.answers.pop()] if worker.answers else []
+    worker.send = lambda *_: None
+
+    def crash(busy: bool) -> bool:
+        worker.crashes += 1
+        return True
+
+    monkeypatch.setattr(segmentation, "SupervisedWorker", lambda *_: worker)
+    monkeypatch.setattr(RemoteSegmenter, "_known_labels", lambda *_: LabelSet(("cup",)))
+    worker.restart_if_needed = crash
+    segmenter = RemoteSegmenter(label_image(tmp_path), tmp_path)
+    segmenter.request(ImageToSegment(7, FRAMES[0].rgb, "a.png"))
+    for _ in range(3):  # at the image, and twice while the network is loaded
+        assert segmenter.receive_masks() == []
+    assert (segmenter.waiting, segmenter.dropped) == (1, 0)
+    worker.answers = [Started(7)]
+    segmenter.receive_masks()
+    assert (segmenter.waiting, segmenter.dropped) == (0, 1)
 
 
 def test_a_viewer_that_is_closed_changes_nothing(tmp_path, monkeypatch) -> None:
