@@ -16,14 +16,19 @@ from typing import Any
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.messages import Ready
-from bmask_slam.live.processes.worker import WorkerEnd, Workstation, WorkstationAwayError
+from bmask_slam.live.processes.worker import (
+    Failure,
+    WorkerEnd,
+    Workstation,
+    WorkstationAwayError,
+)
 
 logger = logging.getLogger(__name__)
 
 RETRY_S = 1.0
 """Between two tries to reach the workstation."""
 REFUSED_S = 60.0
-"""The same after it has refused: it has another token or version."""
+"""The same after it has refused, for another token or version, or the process there has failed."""
 SAVE_S = START_S = 300.0
 """Longest waits for the state, and for a process there to have read it."""
 
@@ -112,4 +117,7 @@ class MapReturn:
                     end.kill()
                 return True
         end.kill()
+        for failure in [m for m in (*found, *end.receive()) if isinstance(m, Failure)]:
+            logger.warning("the workstation's map failed: %s; the map stays here", failure.reason)
+            self._wait_s = REFUSED_S
         return False

@@ -60,7 +60,7 @@ from bmask_slam.live.processes.map_process import MapServer
 from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.processes.map_worker import MapWorker
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
-from bmask_slam.live.processes.worker import WorkstationAwayError
+from bmask_slam.live.processes.worker import Failure, WorkstationAwayError
 from bmask_slam.semantics.labels import read_label_set
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.system import SlamSystem
@@ -536,6 +536,30 @@ def test_a_refusal_later_is_said_and_tried_again(machines, tmp_path, monkeypatch
     machines.there[-1].answers.append(Ready())
     until(lambda: worker.receive() or worker.workstation == "connected")
     assert (worker.losses, here.is_running) == (0, False)
+    worker.kill()
+
+
+def test_a_map_that_fails_there_is_said_and_not_tried_each_second(
+    machines, tmp_path, monkeypatch, caplog
+) -> None:
+    """Each try saves a state of the whole map here and sends it there."""
+    machines.away = True
+    worker = MapWorker((), lambda message: None, MapPlace(tmp_path, machines))
+    machines.away, here = False, machines.here[0]
+
+    def step() -> bool:
+        worker.receive()
+        here.answers += [StateSaved(number, message.path) for number, message in here.sent]
+        here.sent.clear()
+        for there in machines.there:
+            there.answers += [Failure("Traceback", "OSError: no space")] * there.is_running
+            there.is_running = False
+        return "failed: OSError: no space; the map stays here" in caplog.text
+
+    until(step)
+    time.sleep(0.3)
+    step()
+    assert len(machines.there) == 1
     worker.kill()
 
 
