@@ -128,12 +128,16 @@ class SupervisedWorker:
         if messages:
             self._now_heard()
             self._is_ready = True
+        self._log_failures(messages)
+        for message in messages:
+            if isinstance(message, Ready):
+                self.labels = message.labels
+        return [m for m in messages if not isinstance(m, Failure | Ready)]
+
+    def _log_failures(self, messages: list[Any]) -> None:
         for message in messages:
             if isinstance(message, Failure):
                 logger.error("the %s failed: %s", self.name, message.text)
-            elif isinstance(message, Ready):
-                self.labels = message.labels
-        return [m for m in messages if not isinstance(m, Failure | Ready)]
 
     def restart_if_needed(self, busy: bool) -> bool:
         """Restart it if it died, or sent nothing for too long while ``busy``; whether it did."""
@@ -144,6 +148,7 @@ class SupervisedWorker:
         self.crashes += 1
         self._heard_s, self._used_s, self._is_ready = time.monotonic(), 0.0, False
         self._worker.kill()
+        self._log_failures(self._worker.receive())  # that came since
         if self.given_up:
             logger.error("the %s died %d times; it is not restarted", self.name, self.crashes)
             return False
@@ -203,6 +208,7 @@ class DistantWorker(SupervisedWorker):
             return False
         if self.given_up or (self._worker.is_running and not (busy and self._hangs())):
             return False
+        self._log_failures(self._worker.receive())  # that came since; they are no kill
         self.crashes += not self._worker.was_killed
         self._worker.kill()
         if self.given_up:

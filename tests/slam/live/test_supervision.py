@@ -13,7 +13,7 @@ from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import Ready
 from bmask_slam.live.processes import supervision
 from bmask_slam.live.processes.supervision import RestartPolicy, SupervisedWorker
-from bmask_slam.live.processes.worker import Worker
+from bmask_slam.live.processes.worker import Failure, Worker
 
 
 class FakeWorker(SimpleNamespace):
@@ -67,6 +67,21 @@ def test_what_comes_with_the_first_message_is_kept(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(worker._worker, "receive", lambda *_: batches.pop())
     assert worker.wait_until_ready().labels == ("chair",)
     assert worker.receive() == ["masks", "more masks", "later"]
+
+
+def test_why_a_process_has_died_is_said_also_if_it_comes_last(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its end may be seen before its last message has been read."""
+    monkeypatch.setattr(supervision, "Worker", FakeWorker)
+    worker = SupervisedWorker("segmenter", "m:f", (), RestartPolicy())
+    process = worker._worker
+    assert isinstance(process, FakeWorker)
+    process.is_running, process.messages = False, []
+    process.kill = lambda: process.messages.append(Failure("OSError: no space"))
+    assert worker.receive() == []
+    assert worker.restart_if_needed(busy=True)
+    assert "the segmenter failed: OSError: no space" in caplog.text
 
 
 def use_processor(channel: Channel) -> None:
