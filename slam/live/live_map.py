@@ -65,12 +65,13 @@ class LiveMap(SensorInput):
         self._system.wait_for_map(waiting, MAX_MAP_WAIT_S)
 
     def processes(self) -> dict[str, int]:
-        """Process ids by name."""
+        """Process ids by name; that of the calibration until the camera is settled."""
         system = self._system
         owners = {"map": system.remote, "segmenter": system.segmenter, "dense": system.dense}
-        last = {} if system.calibration is None else {"calibration": system.calibration.pid}
         pids = {name: part.worker.pid for name, part in owners.items() if part is not None}
-        return {name: pid for name, pid in (pids | last).items() if pid}  # 0: none here
+        if system.calibration is not None and not system.calibration.done:
+            pids["calibration"] = system.calibration.pid
+        return {name: pid for name, pid in pids.items() if pid}  # 0: none here
 
     def segment(self) -> int:
         """The number of the largest map segment, which ``map`` and ``trajectory`` are of."""

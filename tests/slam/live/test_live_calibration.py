@@ -221,6 +221,15 @@ def test_a_recording_goes_on_with_the_camera_that_is_found(late_sweep, sweep_cam
     assert np.allclose([f.depth_lag_s for f in frames[11:-1]], -sweep_camera.depth_time_offset_s)
 
 
+def test_a_calibration_that_has_ended_is_no_process() -> None:
+    """Its number may be another process's by then."""
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(calibrate="auto")) as slam:
+        assert {"map", "calibration"} == slam.processes().keys()
+        assert slam._system.calibration is not None
+        slam._system.calibration.end()
+        assert {"map"} == slam.processes().keys()
+
+
 def test_an_unknown_choice_is_refused() -> None:
     with pytest.raises(InputError, match="--calibrate on: is not one of auto, report, off"):
         LiveOptions(calibrate="on")
