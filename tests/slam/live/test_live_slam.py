@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import faiss
 import numpy as np
@@ -21,7 +22,7 @@ from feeding import track_frames
 from synthetic_view import CAMERA, PlaneViews, sideways_path
 
 from bmask_slam.config.configuration import resolve
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Arrays
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp
 from bmask_slam.graph.trajectory import read_tum
@@ -31,8 +32,10 @@ from bmask_slam.live.messages import NewKeyframe
 from bmask_slam.live.processes import worker
 from bmask_slam.live.processes.map_worker import MAX_CRASHES, MapWorker
 from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
+from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
+from bmask_slam.live.system import FINISH_KEYFRAME_S, FINISH_S
 from bmask_slam.run_folder.folder import HEALTH
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.system import SlamSystem
@@ -187,6 +190,22 @@ def test_every_pose_is_saved_if_the_map_is_lost(tmp_path, monkeypatch) -> None:
     assert len(read_tum(run / "trajectory.txt")) == 12
     assert len(read_tum(run / "keyframes.txt")) > 1
     assert (run / "landmarks.ply").stat().st_size > 1000
+
+
+def test_the_last_optimisation_of_a_larger_map_may_take_longer(tmp_path, monkeypatch) -> None:
+    """Ended after a fixed time, the map of a run of hours would be lost."""
+    limits_s: list[float] = []
+    finish = RemoteMapper.finish
+
+    def told(mapper: RemoteMapper, timeout_s: float, frames: Arrays) -> Path:
+        limits_s.append((timeout_s - FINISH_S) / len(mapper.world.keyframes))
+        return finish(mapper, timeout_s, frames)
+
+    monkeypatch.setattr(RemoteMapper, "finish", told)
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
+        track_frames(slam, FRAMES[:6])
+        wait_for_the_map(slam)
+    assert limits_s == pytest.approx([FINISH_KEYFRAME_S])
 
 
 def poison_next_keyframe(slam: LiveSlam, monkeypatch: pytest.MonkeyPatch) -> list[int]:
