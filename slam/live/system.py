@@ -42,10 +42,8 @@ from bmask_slam.world.keyframe import Keyframe
 if TYPE_CHECKING:  # it loads torch
     from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 
-MASKS_S = 10.0
-"""Longest wait for the masks of the last keyframes at the end."""
-CALIBRATION_S = 15.0
-"""Longest wait for an estimate of the camera that is under way at the end."""
+MASKS_S, CALIBRATION_S = 10.0, 15.0
+"""Longest waits at the end: for masks of the last keyframes, for an estimate that is under way."""
 FINISH_S, FINISH_KEYFRAME_S = 600.0, 0.5
 """Longest time of the last optimisation, and for each keyframe; 3937 took 144 s on idle cores."""
 REFRESH_FRAMES = 5
