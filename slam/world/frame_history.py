@@ -41,6 +41,7 @@ class FrameHistory:
     def __init__(self) -> None:
         self._entries = DiskRows(1024, (), ENTRY)
         self._size = 0
+        self._counts: Counter[int] = Counter()  # of the frames of each keyframe
         self._parent: dict[int, tuple[int, Array]] = {}
 
     @property
@@ -72,6 +73,7 @@ class FrameHistory:
             self._entries.grow(max(capacity, size - capacity))
         self._entries.write(np.arange(self._size, size), entries)
         self._size = size
+        self._counts.update(entries["keyframe_id"].tolist())
 
     def hand_over(self, keyframe_id: int, parent_id: int, T_parent_keyframe: Array) -> None:
         """A keyframe leaves the map: its frames follow the parent from now on."""
@@ -100,13 +102,11 @@ class FrameHistory:
 
     def frames(self, world: WorldMap) -> Counter[int]:
         """The number of tracked frames whose keyframe was not lost, by map segment."""
-        ids, counts = np.unique(self._store["keyframe_id"][: self._size], return_counts=True)
         found: Counter[int] = Counter()
-        for keyframe_id, count in zip(ids.tolist(), counts.tolist(), strict=True):
-            owner, _ = self.parent(keyframe_id)
+        for keyframe_id, count in self._counts.items():
+            owner = self._owner(keyframe_id)
             if owner != NO_KEYFRAME:
                 found[world.keyframes[owner].segment] += count
-        self._entries.release()
         return found
 
     def smooth(self, world: WorldMap) -> None:
@@ -202,6 +202,7 @@ class FrameHistory:
     def restore(self, state: Arrays) -> None:
         """Become the history of a state. Raises ValueError for keyframes in a circle."""
         self._size, size = 0, len(state["timestamps_s"])
+        self._counts.clear()
         if len(state["information"]) != size:  # of a file that was written without
             state = {**state, "information": np.broadcast_to(UNKNOWN, (size, 6, 6))}
         entries = np.zeros(size, ENTRY)
@@ -212,6 +213,12 @@ class FrameHistory:
         parents = zip(state["heir_ids"].tolist(), state["T_heir_culled"], strict=True)
         self._parent = dict(zip(state["culled_ids"].tolist(), parents, strict=True))
         TopologicalSorter({k: (parent,) for k, (parent, _) in self._parent.items()}).prepare()
+
+    def _owner(self, keyframe_id: int) -> int:
+        """The keyframe that replaces one, or NO_KEYFRAME."""
+        while keyframe_id in self._parent:
+            keyframe_id, _ = self._parent[keyframe_id]
+        return keyframe_id
 
     def _resolve(self, keyframe_id: int, T: Array) -> tuple[int, Array]:
         """The keyframe that replaces one, and poses T (..., 4, 4) relative to it."""
