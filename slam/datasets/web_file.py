@@ -165,6 +165,8 @@ def _receive(file: WebFile, part: Path, progress: Progress) -> None:
     except urllib.error.HTTPError as error:
         if error.code != RANGE_REFUSED:
             raise
+        if error.headers.get("Content-Range") == f"bytes */{begin}":
+            return  # it was complete already
         _remove_part(part)  # it is longer than the server's file
         raise _InterruptedError("the part on disk does not belong to the file") from error
     with response:

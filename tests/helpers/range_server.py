@@ -48,8 +48,11 @@ def serve(served: Served) -> Iterator[Served]:
             begin = 0
             if served.ranges and wanted and self.headers.get("If-Range", tag) == tag:
                 begin = int(re.findall(r"\d+", wanted)[0])
-            if begin > len(content):
-                self.send_error(416)
+            if begin >= len(content):  # RFC 9110: the first byte is beyond the last one
+                self.send_response(416)
+                self.send_header("Content-Range", f"bytes */{len(content)}")
+                self.send_header("Content-Length", "0")
+                self.end_headers()
                 return
             self.send_response(206 if begin else 200)
             if begin:

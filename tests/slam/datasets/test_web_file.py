@@ -99,6 +99,18 @@ def test_parts_of_different_files_are_not_combined(server, tmp_path):
     assert (tmp_path / "f").read_bytes() == CONTENT[::-1]
 
 
+def test_a_part_that_is_complete_is_not_received_again(server, tmp_path):
+    """It was received whole, but the process was killed before it had its name."""
+    (tmp_path / "f.part").write_bytes(CONTENT)
+    (tmp_path / "f.part.mark").write_text(f'"{hash(CONTENT)}"')
+    received: list[int] = []
+    file = WebFile(f"{server.url}/file.tgz", SHA256, len(CONTENT))
+    assert download(file, tmp_path / "f", lambda done, _: received.append(done)) == SHA256
+    assert received == []
+    assert server.requests == [f"bytes={len(CONTENT)}-"]
+    assert names(tmp_path) == ["f"]
+
+
 def test_a_part_longer_than_the_file_is_discarded(server, tmp_path):
     (tmp_path / "f.part").write_bytes(CONTENT * 2)
     (tmp_path / "f.part.mark").write_text(f'"{hash(CONTENT)}"')
