@@ -71,17 +71,19 @@ first steps:
 exit status: 0 done, 1 broken input or a part that failed (one line says what), 2 a wrong command
 line, 128 + N ended by signal N (130: Ctrl-C); what was done until then is saved
 """
-SPACE, RIGHTS, DESCRIPTORS, DEVICE = (
+SPACE, RIGHTS, DESCRIPTORS, DEVICE, PLACE = (
     "free some space",
     "change its permissions, or choose another place",
     "raise the limit of open files: ulimit -n 4096",
     "the disk or the connection to it fails; try again on another",
+    "a file is where a folder has to be, choose another place",
 )
 CURES = {
     **{errno.ENOSPC: SPACE, errno.EDQUOT: SPACE, errno.EFBIG: SPACE},
     **{errno.EACCES: RIGHTS, errno.EPERM: RIGHTS, errno.EROFS: RIGHTS},
     **{errno.EMFILE: DESCRIPTORS, errno.ENFILE: DESCRIPTORS},
     **{errno.EIO: DEVICE, errno.ESTALE: DEVICE, errno.ENODEV: DEVICE},
+    **{errno.ENOTDIR: PLACE, errno.EEXIST: PLACE},
     **{errno.ENAMETOOLONG: "choose a shorter name", errno.ELOOP: "remove the link"},
 }
 MEMORY = "out of memory; free some, raise its limit (ulimit -v), or take smaller input"

@@ -325,6 +325,19 @@ def test_expected_errors(capsys, monkeypatch, error, status: int, expected: str)
     assert found[2].startswith(expected)
 
 
+@pytest.mark.parametrize(
+    "words", ["convert {sequence} {file}/b", "convert {sequence} {file}/b/c",
+              "download tum/freiburg1_xyz --to {file}/b", "workstation --token-file {file}/b"],
+)  # fmt: skip
+def test_a_file_in_the_place_of_a_folder(capsys, sequence: Path, tmp_path: Path, words) -> None:
+    file = tmp_path / "file"
+    file.write_text("")
+    given = words.format(sequence=sequence, file=file).split()
+    status, _, errors = call(capsys, *given)
+    assert status == 1
+    assert re.search(rf"error: {file}\S*: .*; a file is where a folder has to be", errors)
+
+
 def test_unknown_errors_keep_their_traceback(monkeypatch) -> None:
     def fail(arguments: object) -> int:
         raise ProcessLookupError(3, "No such process")
