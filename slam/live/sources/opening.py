@@ -86,7 +86,8 @@ def open_source(text: str, options: SourceOptions) -> Source:
         follow = FollowOptions(silence_s=options.silence_s)
         source = GrowingFolder(path, options.camera, follow)
     elif path.is_dir() or is_recording_file(path):
-        sequence = open_sequence(path, camera=options.camera, full_size=options.full_size)
+        given = options.topics.of_path(path)
+        sequence = open_sequence(given, camera=options.camera, full_size=options.full_size)
         source = RecordedSource(sequence, options.realtime)
     else:
         raise InputError(

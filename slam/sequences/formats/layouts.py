@@ -99,6 +99,8 @@ def _open(path: Path, camera: Given) -> Recording:
             "holds rgb.txt"
         )
     if not path.is_dir():
+        if bag != path and bag.exists():
+            raise InputError(f"{bag}: is no ROS bag; leave --rgb-topic and other topics out")
         beside: list[str] = []
         with suppress(OSError):  # no folder either, or one that may not be read
             beside = [other.name for other in islice(path.parent.iterdir(), MOST_BESIDE)]

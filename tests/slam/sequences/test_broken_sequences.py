@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.sequences.bags.topics import BagTopics
 from bmask_slam.sequences.sequence import SequenceConfig, open_sequence
 
 
@@ -174,3 +175,9 @@ def test_bad_lists(folder, change, words):
 def test_missing_folder(tmp_path):
     with pytest.raises(InputError, match="no such folder"):
         open_sequence(tmp_path / "none")
+
+
+def test_topics_of_what_is_no_bag(folder):
+    given = BagTopics("/camera/rgb").of_path(folder)
+    with pytest.raises(InputError, match=f"^{folder}: is no ROS bag.*; leave .*--rgb-topic.* out$"):
+        open_sequence(given)
