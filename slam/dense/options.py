@@ -61,6 +61,14 @@ class MapOptions:
         return self.voxel_m if self.mesh_voxel_m is None else self.mesh_voxel_m
 
 
+def check_voxels(options: MapOptions) -> None:
+    """Raise InputError for a voxel size that is out of range."""
+    low, high = VOXEL_RANGE_M
+    for voxel_m in (options.voxel_m, options.surface_voxel_m):
+        if not low <= voxel_m <= high:
+            raise InputError(f"voxel {voxel_m} m: must be between {low:g} and {high:g}")
+
+
 def resolve_options(options: MapOptions, labels: LabelSet) -> MapOptions:
     """The options, checked, with ``excluded`` filled in.
 
@@ -69,10 +77,7 @@ def resolve_options(options: MapOptions, labels: LabelSet) -> MapOptions:
             is not in ``labels``.
     """
     check_device(options.device)
-    low, high = VOXEL_RANGE_M
-    for voxel_m in (options.voxel_m, options.surface_voxel_m):
-        if not low <= voxel_m <= high:
-            raise InputError(f"voxel {voxel_m} m: must be between {low:g} and {high:g}")
+    check_voxels(options)
     excluded = options.excluded
     if excluded is None:
         movability = read_priors("movability").of(labels)

@@ -243,6 +243,9 @@ def _system_maker(
         upright = upright_of(chosen, sequence, run_indices(sequence, options))
     if given is None and options.dense:
         import_dense("--map")
+        from bmask_slam.dense.options import MapOptions, check_voxels  # noqa: PLC0415 - loads torch
+
+        check_voxels(MapOptions(folder, mesh_voxel_m=options.mesh_voxel_m))
     if given is not None:
         yield given, None
     elif options.parallel:

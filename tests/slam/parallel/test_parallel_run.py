@@ -118,6 +118,13 @@ def test_it_goes_on_when_the_maps_process_dies(
     assert "does not give the same bytes again" in (folder / "log.txt").read_text()
 
 
+def test_a_wrong_voxel_is_refused_before_the_first_frame(slow_office: Path, tmp_path) -> None:
+    wrong = options(slow_office, tmp_path / "run", dense=True, mesh_voxel_m=-1.0)
+    with pytest.raises(InputError, match=r"voxel -1\.0 m: must be between"):
+        run(wrong)
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_map_of_another_run_is_refused(slow_office: Path, whole: Path) -> None:
     with pytest.raises(InputError, match=r"--parallel: .* without --continue"):
         options(slow_office, whole, map=whole)
