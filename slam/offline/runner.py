@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +43,7 @@ from bmask_slam.run_folder.metrics import RunCounters
 from bmask_slam.run_folder.open_files import free_run_path
 from bmask_slam.run_folder.origin import Origin
 from bmask_slam.run_folder.reader import Run
+from bmask_slam.runtime.machine import versions
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.semantics.segmenters.upright import Upright
@@ -214,8 +214,8 @@ def describe_run(folder: RunFolder, options: RunOptions, sequence: Sequence) -> 
     folder.write_text("config.yaml", f"# {origin}\n{dump(options.config)}")
     logger.info("%s: %s", origin, shlex.join(sys.argv))
     packages = ("gtsam", "numpy", "opencv-python-headless")
-    versions = ", ".join(f"{package} {version(package)}" for package in packages)
-    logger.info("%s, Python %s, %s", platform.platform(), platform.python_version(), versions)
+    found = ", ".join(f"{package} {known}" for package, known in versions(packages).items())
+    logger.info("%s, Python %s, %s", platform.platform(), platform.python_version(), found)
     logger.info("camera from %s: %s", sequence.camera_source, sequence.camera)
     pairs = sequence.pairs
     unpaired = f"{pairs.unpaired_rgb} colour and {pairs.unpaired_depth} depth images"

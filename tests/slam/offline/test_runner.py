@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import errno
+import importlib.metadata
 import json
 import logging
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -103,6 +105,22 @@ def test_a_relative_sequence_is_recorded_by_its_absolute_path(
     monkeypatch.chdir("/")
     assert find_sequence(out) == sequence
     assert f", sequence {sequence}, stride 1" in (out / "config.yaml").read_text()
+
+
+def test_a_library_that_another_package_has_is_no_hindrance(
+    sequence: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """OpenCV may come from conda or from another of its packages."""
+    find = importlib.metadata.distribution
+
+    def others(name: str) -> importlib.metadata.Distribution:
+        if name.startswith("opencv"):
+            raise importlib.metadata.PackageNotFoundError(name)
+        return find(name)
+
+    monkeypatch.setattr(importlib.metadata, "distribution", others)
+    fake_run(sequence, out)
+    assert re.search(r"gtsam [0-9.]+, numpy [0-9.]+$", (out / "log.txt").read_text(), re.MULTILINE)
 
 
 def test_frames_csv(sequence: Path, out: Path) -> None:
