@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import signal
 import tempfile
 from pathlib import Path
 
@@ -34,7 +35,7 @@ def calibrate_in_rounds(options: CalibrateOptions, rounds: int, quiet: bool = Fa
     It ends earlier when a round agrees with the one before within the bounds of both.
 
     The new runs have the configuration of the first and are not kept. The camera file is written at
-    the end.
+    the end. A signal that stops one of them ends all, and acts as usual.
 
     Returns:
         The last calibration; its ``before`` is the camera of the first run.
@@ -56,12 +57,11 @@ def calibrate_in_rounds(options: CalibrateOptions, rounds: int, quiet: bool = Fa
             again = folder / f"run-{k}"
             used = _again(options.run, sequence, done.path, again)
             full_size = before.reduced_by == 1
-            run(dataclasses.replace(used, quiet=quiet, full_size=full_size))
-            camera = folder / f"camera-{k}.yaml"
-            earlier, done = (
-                done,
-                calibrate_run(dataclasses.replace(options_1, run=again, out=camera)),
-            )
+            summary = run(dataclasses.replace(used, quiet=quiet, full_size=full_size))
+            if summary.stopped_by is not None:
+                signal.raise_signal(summary.stopped_by)
+            camera, earlier = folder / f"camera-{k}.yaml", done
+            done = calibrate_run(dataclasses.replace(options_1, run=again, out=camera))
             if done.agrees_with(earlier):
                 logger.info("calibrated %d times: nothing changes any more", k)
                 break

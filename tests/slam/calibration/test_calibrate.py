@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from bmask_slam.features.keypoint_depth import smooth_value
 from bmask_slam.graph.calibration.model import TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.offline import calibration_rounds
+from bmask_slam.offline.run_end import RunSummary
 from bmask_slam.sequences.cameras import read_camera, write_camera
 from bmask_slam.sequences.sequence import open_sequence
 
@@ -194,6 +197,19 @@ def test_two_rounds_rerun_with_the_found_camera(
     assert found[0] != found[1]
     for camera in found:
         assert camera.fx == pytest.approx(truth.fx, rel=0.01)
+
+
+def test_a_stop_in_a_later_round_ends_the_calibration(
+    made: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The camera of a run that was cut off is none to write."""
+    sequence, run = made
+    stopped = RunSummary(Path("run-2"), [], 7, 0, signal.SIGINT)
+    monkeypatch.setattr(calibration_rounds, "run", lambda options: stopped)
+    options = CalibrateOptions(run, tmp_path / "camera.yaml", sequence=sequence)
+    with pytest.raises(KeyboardInterrupt):
+        calibration_rounds.calibrate_in_rounds(options, 2)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_images_of_another_recording_are_named(made: tuple[Path, Path], tmp_path: Path) -> None:
