@@ -38,6 +38,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -57,6 +58,7 @@ from bmask_slam.run_folder.landmark_file import MARKERS
 from bmask_slam.run_folder.open_files import LOG, OpenFiles
 from bmask_slam.run_folder.semantic_files import SEMANTIC_FILES
 from bmask_slam.runtime.memory import is_out_of_memory
+from bmask_slam.sequences.formats.layouts import is_recording_folder
 from bmask_slam.tracking.results import FrameResult
 
 FILES = (
@@ -64,15 +66,13 @@ FILES = (
     *("graph", "map", "metrics.json", "trajectory.png", LOG),
 )
 CAMERA, CHECKPOINT = "camera.yaml", "checkpoint"
-SEQUENCE_FILES = ("rgb.txt", "depth.txt", "associations.txt")
-"""What is only in a folder that nothing may be removed from."""
 DENSE, HEALTH = "dense", "health.json"
 REPORT, FILM = "report.html", "film.gif"
 SOMETIMES = (
     *(CHECKPOINT, CAMERA, COVARIANCES, HEALTH, JOINED, MARKERS, REPORT, FILM),
     *SEMANTIC_FILES,
 )
-OTHER_PATHS = "trajectory_*_*.txt"  # of segments, and of merged runs
+OTHER_PATHS = re.compile(r"trajectory_(segment|run)_\d+\.txt")
 ELSEWHERE = "choose another folder with --out"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("bmask_slam",)
@@ -253,9 +253,8 @@ class RunFolder:
 
 def _clear(path: Path, overwrite: bool) -> None:
     """Remove the run in a folder, its checkpoint first. Raises InputError."""
-    for name in SEQUENCE_FILES:
-        if (path / name).exists():
-            raise InputError(f"{path}: is a sequence ({name}), not a run; choose another --out")
+    if is_recording_folder(path):
+        raise InputError(f"{path}: is a sequence, not a run; choose another --out")
     held = [name for name in (*SOMETIMES, *FILES) if os.path.lexists(path / name)]
     if held and not overwrite:
         cure = "go on with --resume, " if held[0] == CHECKPOINT else ""
@@ -267,7 +266,8 @@ def _clear(path: Path, overwrite: bool) -> None:
         if (path / FRAMES).is_file():
             with (path / FRAMES).open("rb") as file:
                 lock_file(file, path)
-        _remove(path, [*held, DENSE, *(f.name for f in path.glob(OTHER_PATHS))] if held else [])
+        others = [f.name for f in path.iterdir() if OTHER_PATHS.fullmatch(f.name)]
+        _remove(path, [*held, DENSE, *others] if held else [])
 
 
 def _make_folder(path: Path) -> list[Path]:

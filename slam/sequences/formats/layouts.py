@@ -74,6 +74,12 @@ def is_recording_file(path: Path) -> bool:
     return is_bag(bag) or any(layout.is_one(path) for layout in FILES)
 
 
+def is_recording_folder(path: Path) -> bool:
+    """Whether it is the folder of a recording: with a list of TUM's, a bag, or another layout."""
+    listed = any((path / name).is_file() for name in _LISTS)
+    return listed or is_bag(path) or any(layout.is_one(path) for layout in FOLDERS)
+
+
 def open_recording(path: Path, camera: Given = None) -> Recording:
     """Open what lies at a path, in any layout of docs/data.md, without images that were repeated.
 

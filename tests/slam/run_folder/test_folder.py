@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from small_layouts import SMALL_LAYOUTS, write_small
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.run_folder import folder as folder_module
@@ -150,3 +151,23 @@ def test_a_sequence_is_not_overwritten(tmp_path: Path, overwrite: bool) -> None:
     with pytest.raises(InputError, match="is a sequence"):
         RunFolder(tmp_path, overwrite=overwrite)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["camera.yaml", "depth.txt", "rgb.txt"]
+
+
+@pytest.mark.parametrize("layout", SMALL_LAYOUTS, ids=lambda layout: layout.name)
+def test_a_recording_in_another_layout_is_not_overwritten(layout, tmp_path: Path) -> None:
+    folder = write_small(layout, tmp_path)
+    if not folder.is_dir():
+        return
+    (folder / "camera.yaml").write_text("mine")
+    before = sorted(folder.rglob("*"))
+    with pytest.raises(InputError, match="is a sequence"):
+        RunFolder(folder, overwrite=True)
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_files_of_others_with_names_like_those_of_a_run_stay(tmp_path: Path) -> None:
+    own, foreign = ("trajectory_segment_2.txt", "trajectory_run_1.txt"), "trajectory_of_mocap.txt"
+    for name in ("trajectory.txt", *own, foreign):
+        (tmp_path / name).write_text("")
+    with RunFolder(tmp_path, overwrite=True):
+        assert [p.name for p in tmp_path.glob("trajectory*")] == [foreign]
