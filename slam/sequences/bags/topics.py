@@ -117,12 +117,17 @@ def _form_of(wish: str, images: list[str]) -> str:
     return next((name for name in forms if name in images), "")
 
 
+def _uncompressed(topic: str) -> str:
+    """The topic of which this one is a compressed form, or itself."""
+    return topic.removesuffix("/compressed").removesuffix("/compressedDepth")
+
+
 def _info_topic(bag: Bag, topic: str) -> str:
     """The camera_info topic of an image topic: beside it, or where RealSense's SDK has it in ROS 1.
 
     Of the two the one that the bag has.
     """
-    base = topic.removesuffix("/compressed").removesuffix("/compressedDepth")
+    base = _uncompressed(topic)
     beside = f"{base.rpartition('/')[0]}/camera_info"
     sdk = f"{base.removesuffix('/image/data')}/info/camera_info"
     return sdk if base.endswith("/image/data") and beside not in _infos(bag) else beside
@@ -184,7 +189,7 @@ def _depth_scale(bag: Bag, depth: Any, topic: str) -> float:
 
 def _camera_of(bag: Bag, topic: str, info: str, scale: float) -> tuple[Camera, Lens | None]:
     """The camera of an image topic by its camera_info, and its lens. Raises InputError."""
-    rectified = "_rect" in topic.removesuffix("/compressed").rpartition("/")[2]
+    rectified = "_rect" in _uncompressed(topic).rpartition("/")[2]
     return camera_of(_camera_info(bag, info), scale, rectified, f"{bag.path}: {info}")
 
 

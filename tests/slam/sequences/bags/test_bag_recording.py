@@ -8,7 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recorded_bags import BEGIN_S, RGB, STEP_S, TYPES, BagMaker, camera_info, image, view, write_bag
+from recorded_bags import (
+    BEGIN_S,
+    RGB,
+    STEP_S,
+    TYPES,
+    BagMaker,
+    camera_info,
+    compressed,
+    image,
+    view,
+    write_bag,
+)
 from small_layouts import COARSE, COLOUR, WALL_M, colour, depth_m, hole
 
 from bmask_slam.cli import main
@@ -75,19 +86,28 @@ T_COLOUR_DEPTH[0, 3] = 0.1
 SDK = "/device_0/sensor_{}/{}_0"
 
 
-def write_unregistered(path: Path, known: bool = True) -> Path:
-    """Coarse depth 10 cm to the right of colour, by /tf_static over a common base."""
+def write_unregistered(path: Path, known: bool = True, packed: bool = False) -> Path:
+    """Coarse depth 10 cm to the right of colour, by /tf_static over a common base.
+
+    It is rectified: what the depth camera's lens did to the images as they were does not count.
+    """
+    of_depth = info_of(COARSE)
+    of_depth.d[0] = 0.5
     T_base_colour = se3_exp(np.array([0.1, -0.2, 0.3, 1.0, 2.0, 3.0]))
     with BagMaker(path) as bag:
         if known:
             bag.write_transform("/tf_static", T_base_colour, ("base", "/rgb"))
             bag.write_transform("/tf_static", T_base_colour @ T_COLOUR_DEPTH, ("base", "ir"))
         bag.write("/camera/color/camera_info", 1.0, info_of(COLOUR))
-        bag.write("/camera/depth/camera_info", 1.0, info_of(COARSE))
+        bag.write("/camera/depth/camera_info", 1.0, of_depth)
         for k in range(3):
             bag.write("/camera/color/image_raw", 1 + k / 30, image("rgb8", colour(k)), "rgb")
             values = np.rint(1000 * depth_m(COARSE)).astype(np.uint16)
-            bag.write("/camera/depth/image_rect_raw", 1 + k / 30, image("16UC1", values), "/ir")
+            topic, depth = "/camera/depth/image_rect_raw", image("16UC1", values)
+            if packed:
+                topic = f"{topic}/compressedDepth"
+                depth = compressed("16UC1; compressedDepth png", ".png", values, bytes(12))
+            bag.write(topic, 1 + k / 30, depth, "/ir")
     return path
 
 
@@ -124,6 +144,14 @@ def test_depth_of_its_own_camera_is_registered(write, name: str, tmp_path: Path)
     for found, written in ((missing[0], edges.start), (missing[-1] + 1, edges.stop)):
         ray = (written - 0.5 - COARSE.cx) / COARSE.fx + 0.1 / WALL_M
         assert found - 0.5 == pytest.approx(COLOUR.fx * ray + COLOUR.cx, abs=1.01)
+
+
+def test_depth_in_its_compressed_form_is_of_the_same_camera(tmp_path: Path) -> None:
+    plain, packed = (
+        open_sequence(write_unregistered(tmp_path / name, packed=name == "packed")).load(1)
+        for name in ("plain", "packed")
+    )
+    assert np.array_equal(packed.depth_m, plain.depth_m, equal_nan=True)
 
 
 def test_depth_whose_place_is_not_told_is_refused(tmp_path: Path, caplog) -> None:
