@@ -204,4 +204,4 @@ def _columns(
 def _named(labels: NDArray, names: tuple[str, ...], path: Path) -> NDArray[np.str_]:
     if len(labels) and not 0 <= labels.min() <= labels.max() < len(names):
         raise InputError(f"{path}: a label beyond the {len(names)} of the run; make it again")
-    return np.array(names, np.str_)[labels]
+    return np.array(names, np.str_)[labels.astype(np.int64)]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.ply import read_ply, write_ply
 from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.cloud_files import CloudWriter
 from bmask_slam.run_folder.landmark_file import read_dense_cloud
@@ -34,6 +35,18 @@ def test_a_cloud_that_is_not_finite_is_refused(tmp_path: Path, value: float, col
     assert len(read_dense_cloud(write_cloud(tmp_path / "good"), NAMES)) == 3
     with pytest.raises(InputError, match=r"bad\.ply: a point or normal is not finite; make it"):
         read_dense_cloud(write_cloud(tmp_path / "bad", value, column), NAMES)
+
+
+def test_labels_that_another_program_saved_as_floats_are_read(tmp_path: Path) -> None:
+    columns = read_ply(write_cloud(tmp_path / "cloud"))
+    for value in (1.0, np.nan):
+        label = np.full(3, value, np.float32)
+        write_ply(tmp_path / "edited.ply", {**columns, "label": label})
+        if np.isfinite(value):
+            assert read_dense_cloud(tmp_path / "edited.ply", NAMES).labels.tolist() == ["chair"] * 3
+        else:
+            with pytest.raises(InputError, match="a label beyond the 2 of the run"):
+                read_dense_cloud(tmp_path / "edited.ply", NAMES)
 
 
 def test_a_users_own_file_beside_the_objects_is_no_object(tmp_path: Path) -> None:
