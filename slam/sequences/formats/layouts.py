@@ -84,8 +84,14 @@ def open_recording(path: Path, camera: Given = None) -> Recording:
     """Open what lies at a path, in any layout of docs/data.md, without images that were repeated.
 
     Raises:
-        InputError: nothing there, no known layout, or files that are broken.
+        InputError: nothing there, no known layout, a name that is no UTF-8, or files that are
+            broken.
     """
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError as error:
+        name = repr(str(path))
+        raise InputError(f"{name}: its name, or one above, is not UTF-8; rename it") from error
     return without_repeats(_open(path, camera))
 
 

@@ -1,5 +1,6 @@
 """Broken input: one clear line for each case; a single broken frame is skipped."""
 
+import os
 import re
 from pathlib import Path
 
@@ -181,3 +182,10 @@ def test_topics_of_what_is_no_bag(folder):
     given = BagTopics("/camera/rgb").of_path(folder)
     with pytest.raises(InputError, match=f"^{folder}: is no ROS bag.*; leave .*--rgb-topic.* out$"):
         open_sequence(given)
+
+
+def test_a_name_that_is_no_text(folder):
+    """As old systems wrote it, in Latin-1: neither config.yaml nor the log can hold it."""
+    named = folder.rename(folder.with_name(os.fsdecode(b"caf\xe9")))
+    with pytest.raises(InputError, match=r"caf.udce9': .* not UTF-8; rename it"):
+        open_sequence(named)
