@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import struct
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -64,12 +66,9 @@ def open_sens(path: Path, given: Path | Camera | None) -> Recording:
     Raises:
         InputError: another version or compression, or a file that is cut off.
     """
-    try:
-        with open(path, "rb") as file:
-            header = _read_header(file, path)
-            frames, poses, ticks = _read_index(file, path, header)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); {_CURE}") from error
+    with _opened(path) as file:
+        header = _read_header(file, path)
+        frames, poses, ticks = _read_index(file, path, header)
     stamps_s = ticks * MICROSECONDS
     for kind in range(2):
         if not stamps_s[:, kind].any():
@@ -89,6 +88,16 @@ def open_sens(path: Path, given: Path | Camera | None) -> Recording:
         trajectory_of(stamps_s[:, 0], poses, str(path)), DepthForm(0, depth_camera, T),
         images.colour, images.depth, places.__contains__,
     )  # fmt: skip
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[IO[bytes]]:
+    """The file, to be read in the block. Raises InputError if it cannot be."""
+    try:
+        with open(path, "rb") as file:
+            yield file
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {_CURE}") from error
 
 
 def _read_header(file: IO[bytes], path: Path) -> _Header:
@@ -166,6 +175,6 @@ class _SensImages:
         return np.frombuffer(data, "<u2").reshape(height, width).astype(np.uint16)
 
     def _bytes(self, begin: int, size: int) -> bytes:
-        with open(self._path, "rb") as file:
+        with _opened(self._path) as file:
             file.seek(begin)
             return _exactly(file, size, self._path)

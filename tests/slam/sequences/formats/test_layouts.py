@@ -232,6 +232,15 @@ def check_refused(path: Path, file: str, text: str, reason: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("layout", SMALL_LAYOUTS, ids=lambda layout: layout.name)
+def test_a_recording_that_is_gone_while_it_is_read(layout: SmallLayout, tmp_path: Path) -> None:
+    """As of a disk that is unplugged."""
+    sequence = open_sequence(write_small(layout, tmp_path))
+    sequence.folder.rename(tmp_path / "unplugged")
+    with pytest.raises(InputError, match=str(sequence.folder)):
+        sequence.load(1)
+
+
 @pytest.mark.parametrize("file", ["scene.sens", "a.r3d"])
 def test_a_file_that_is_cut_off_is_refused(file: str, tmp_path: Path) -> None:
     path = write_small(next(small for small in SMALL_LAYOUTS if small.file == file), tmp_path)
