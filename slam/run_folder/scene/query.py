@@ -51,6 +51,7 @@ class Answer:
         omitted: number of objects beyond those that were asked for.
         distances_m: of the objects from the place that was asked for; empty without one.
         others: of each object, those that it has the relation to, as text; empty without one.
+        relation: that was asked for, and to what, as text; "" for none.
     """
 
     label: str
@@ -59,6 +60,7 @@ class Answer:
     omitted: int = 0
     distances_m: tuple[float, ...] = ()
     others: tuple[str, ...] = ()
+    relation: str = ""
 
 
 def query(run: Path, label: str | None, most: int | None = None) -> Answer:
@@ -102,6 +104,7 @@ def ask(run: Path, asked: Asked) -> Answer:
         len(ordered) - len(shown),
         () if place is None else tuple(distance_m(o.box, place) for o in shown),
         tuple(others[o.id] for o in shown) if asked.relation is not None else (),
+        f"{asked.relation} {asked.other or 'any other'}" if asked.relation is not None else "",
     )
 
 
@@ -136,7 +139,8 @@ def _related(run: Path, scene: SavedScene, asked: Asked) -> dict[int, str]:
 def format_answer(answer: Answer) -> str:
     """One line an object: position and size in metres, probability, observing keyframes."""
     if not answer.objects:
-        return f"no {answer.label or 'object'}; the run holds {_listed(answer.counts)}"
+        sought = " ".join(filter(None, (answer.label or "object", answer.relation)))
+        return f"no {sought}; the run holds {_listed(answer.counts)}"
     head = f"{'label':<16}{'id':>5}  {'x, y, z (world, m)':<24}{'size (m)':<19}{'sure':>5}"
     more = ["distance (m)"] * bool(answer.distances_m) + ["relation"] * bool(answer.others)
     lines = ["  ".join([head, *more, "keyframes"])]

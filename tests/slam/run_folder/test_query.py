@@ -115,6 +115,13 @@ def test_unknown_labels_in_a_query(run: Path, capsys: pytest.CaptureFixture[str]
     assert "the set has chair, desk, cup" in error
 
 
+def test_an_empty_answer_names_the_relation_that_was_asked_for(run: Path) -> None:
+    """The run holds chairs; none is in that relation."""
+    for other, words in (("desk", "desk"), ("1", "1"), ("", "any other")):
+        text = format_answer(ask(run, Asked("chair", relation="inside", other=other)))
+        assert text == f"no chair inside {words}; the run holds chair (2), desk (1)"
+
+
 def test_runs_without_objects_or_with_broken_ones(run: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="had a segmenter"):
         query(tmp_path / "nothing", "chair")
