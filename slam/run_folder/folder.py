@@ -40,7 +40,7 @@ import logging
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -262,10 +262,9 @@ def _clear(path: Path, overwrite: bool) -> None:
             f"{path}: already holds a run ({held[0]}); {cure}choose another --out or add "
             "--overwrite"
         )
-    with writing(path, ELSEWHERE):
+    with writing(path, ELSEWHERE), ExitStack() as opened:
         if (path / FRAMES).is_file():
-            with (path / FRAMES).open("rb") as file:
-                lock_file(file, path)
+            lock_file(opened.enter_context((path / FRAMES).open("rb")), path)
         others = [f.name for f in path.iterdir() if OTHER_PATHS.fullmatch(f.name)]
         _remove(path, [*held, DENSE, *others] if held else [])
 

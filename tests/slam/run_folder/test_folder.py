@@ -53,6 +53,27 @@ def test_overwrite_removes_only_the_run(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == names
 
 
+def test_of_two_that_overwrite_a_run_at_once_one_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second one comes while the first removes the files of before."""
+    (tmp_path / "frames.csv").write_text("earlier")
+    remove, refused = folder_module.remove, list[InputError]()
+
+    def slowly(path: Path) -> None:
+        monkeypatch.setattr(folder_module, "remove", remove)
+        with pytest.raises(InputError, match="a process is writing a run there") as caught:
+            RunFolder(tmp_path, overwrite=True)
+        refused.append(caught.value)
+        remove(path)
+
+    monkeypatch.setattr(folder_module, "remove", slowly)
+    with RunFolder(tmp_path, overwrite=True) as folder:
+        folder.write_frame(RESULT)
+    assert len((tmp_path / "frames.csv").read_text().splitlines()) == 2
+    assert len(refused) == 1
+
+
 def test_a_file_at_the_run_folders_path(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"file: is a file; choose another folder with --out"):
