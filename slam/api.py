@@ -69,7 +69,7 @@ def run(
     """Run the system over a sequence, as ``bmask-slam run`` does, and return its run folder.
 
     Args:
-        sequence: folder in TUM layout.
+        sequence: a recording in any layout of docs/data.md.
         out: the run folder; None: the first free ``runs/<sequence>[-<n>]``.
         segmenter: "light", "none", ..., or options; None: that of the configuration.
         config: a configuration, a YAML file, or the name of a shipped one, such as "paper".

@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,13 @@ def test_a_public_name_is_importable_described_and_documented(name: str) -> None
     assert name in dir(bmask_slam)
     assert name == "__version__" or inspect.getdoc(value)
     assert f"`{name}`" in REFERENCE
+
+
+@pytest.mark.parametrize("kind", [RunKeywords, MapKeywords, bmask_slam.Run])
+def test_each_keyword_and_each_part_of_a_run_is_documented(kind: type) -> None:
+    parts = {n for n, v in vars(kind).items() if isinstance(v, (property, cached_property))}
+    names = parts or set(kind.__annotations__)
+    assert not [n for n in names if not n.startswith("_") and f"`{n}`" not in REFERENCE]
 
 
 def test_type_checkers_find_each_name_where_it_is_loaded_from() -> None:

@@ -28,7 +28,7 @@ class RunOptions:
     """What to run and where to put it.
 
     Attributes:
-        sequence: folder in TUM layout.
+        sequence: a recording in any layout of docs/data.md.
         config: of the system.
         config_name: part of the run folder's name where ``out`` is None.
         out: the run folder; None: the first free ``runs/<sequence>[-<config_name>][-<n>]``.

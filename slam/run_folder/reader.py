@@ -242,7 +242,7 @@ class Run:
 
     @cached_property
     def sequence(self) -> Path | None:
-        """The folder of the sequence that the run was made from; None for a camera or a bag."""
+        """The folder or file of the recording that the run was made from; None for a camera."""
         return read_origin(self.path).sequence
 
     @cached_property
