@@ -88,7 +88,7 @@ def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummar
         begin = replace(inherited_calibration(options, sequence), covered=covered)
         calibrator = _calibrator(options, begin, masks)
         if calibrator.state.adopted:
-            sequence = open_sequence(options.sequence, camera=calibrator.state.camera)
+            sequence = sequence.with_camera(calibrator.state.camera)
         active = ActiveRun(
             options,
             sequence,
@@ -149,9 +149,8 @@ def _refuse_inputs(out: Path, options: RunOptions) -> None:
 def _finished(active: ActiveRun, make_system: MakeSystem) -> RunSummary:
     """A run after its last frame, begun anew as often as another camera was found for it."""
     while process_frames(active):
-        options, camera = active.options, active.calibrator.state.camera
-        active.sequence = open_sequence(options.sequence, camera=camera)
-        system = start_system(options, active.sequence, make_system)
+        active.sequence = active.sequence.with_camera(active.calibrator.state.camera)
+        system = start_system(active.options, active.sequence, make_system)
         active.system = with_sensors(system, active.sequence)
         del system
         active.counters = RunCounters(wall_s=active.counters.wall_s)

@@ -56,6 +56,8 @@ from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.semantics.segmenters.upright import Upright
 from bmask_slam.sequences.cameras import read_camera, write_camera
+from bmask_slam.sequences.formats.layouts import open_recording
+from bmask_slam.sequences.recording import Recording
 from bmask_slam.sequences.sequence import Sequence, open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
@@ -705,3 +707,22 @@ def test_a_run_that_begins_anew_frees_the_system_of_before(
     run(RunOptions(folder, out=tmp_path / "out", quiet=True), make)
     assert alive == [1, 1, 1]
     assert len(systems) == 3
+
+
+def test_a_run_that_begins_anew_opens_its_recording_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A bag would be read from its beginning to its end for the stamps."""
+    opened: list[Path] = []
+
+    def counted(path: Path, camera: Camera | None) -> Recording:
+        opened.append(path)
+        return open_recording(path, camera)
+
+    monkeypatch.setattr("bmask_slam.sequences.sequence.open_recording", counted)
+    again = iter([True, True, False])
+    monkeypatch.setattr(runner, "process_frames", lambda run: next(again))
+    monkeypatch.setattr(runner, "finish_run", lambda run: run)
+    folder = make_sequence(tmp_path / "seq")
+    run(RunOptions(folder, out=tmp_path / "out", quiet=True), FakeSystem)
+    assert opened == [folder]
