@@ -130,15 +130,22 @@ def _with_present_names(tree: Any, prefix: str = "") -> Any:
     """A document with older names of settings replaced; not where the present name is given too."""
     if not isinstance(tree, dict):
         return tree
-    found: dict[str, Any] = {}
+    found, moved = dict[str, Any](), dict[str, str]()
     for key, value in tree.items():
         if value == REMOVED.get(f"{prefix}{key}", (...,))[0]:
             continue
-        name = RENAMED.get(f"{prefix}{key}", key)
-        name = key if name in tree else name
-        group, _, within = str(name).rpartition(".")
-        target = found.setdefault(group, {}) if group else found
-        target[within] = _with_present_names(value, f"{prefix}{name}.")
+        name = str(RENAMED.get(f"{prefix}{key}", key))
+        if "." in name:
+            moved[key] = name
+        else:
+            name = key if name in tree else name
+            found[name] = _with_present_names(value, f"{prefix}{name}.")
+    for key, name in moved.items():
+        group, _, within = name.rpartition(".")
+        target = found.setdefault(group, {})
+        fits = isinstance(target, dict) and within not in target
+        value = _with_present_names(tree[key], f"{prefix}{name}.")
+        (target if fits else found)[within if fits else key] = value
     return found
 
 

@@ -302,6 +302,21 @@ def test_an_older_and_the_present_name_in_one_file_are_refused(tmp_path: Path) -
         resolve(SystemConfig, file)
 
 
+@pytest.mark.parametrize("text", ["{old}, {new}", "{new}, {old}"])
+def test_an_older_setting_beside_others_of_its_present_group(tmp_path: Path, text: str) -> None:
+    """The group may be given too, before or after it."""
+
+    def loops(new: str) -> str:
+        return "loops: {" + text.format(old="drift_rad_per_m: 0.5", new=f"noise: {new}") + "}\n"
+
+    noise = resolve(SystemConfig, write(tmp_path, loops("{model_share: 0.25}"))).loops.noise
+    assert (noise.drift_rad_per_m, noise.model_share) == (0.5, 0.25)
+    with pytest.raises(InputError, match=r"drift_rad_per_m; it is called loops\.noise\.drift_rad"):
+        resolve(SystemConfig, write(tmp_path, loops("{drift_rad_per_m: 0.25}")))
+    with pytest.raises(InputError, match=r"loops\.noise is a group|drift_rad_per_m; it is called"):
+        resolve(SystemConfig, write(tmp_path, loops("5")))
+
+
 def test_a_setting_that_is_no_more_is_named_with_what_serves_now(tmp_path: Path) -> None:
     file = tmp_path / "old.yaml"
     file.write_text("features: {octaves: 2}")
