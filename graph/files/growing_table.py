@@ -14,6 +14,9 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_lock import lock_file
 from bmask_slam.graph.files.whole_file import whole_file
 
+NO_TEXT = "backslashreplace"
+"""How a file holds what is no text, such as a path in Latin-1."""
+
 
 class GrowingTable:
     """A csv file to which lines are appended; each is flushed, so that a kill leaves whole lines.
@@ -25,7 +28,7 @@ class GrowingTable:
     def __init__(self, path: Path, columns: tuple[str, ...], mode: str) -> None:
         """Open a file, in mode "x" a new one, in mode "a" one that may be there; OSError if not."""
         self._columns, self._is_locked = columns, False
-        self._go_on(path.open(f"{mode}+", encoding="utf-8", newline=""))
+        self._go_on(path.open(f"{mode}+", encoding="utf-8", errors=NO_TEXT, newline=""))
 
     def _go_on(self, file: IO[str]) -> None:
         self.file = file
@@ -83,7 +86,7 @@ def written_again(file: IO[str], path: Path, is_locked: bool = False) -> TextIOW
         InputError: another process holds the lock.
     """
     with whole_file(path) as temporary:
-        new = temporary.open("w+", encoding="utf-8", newline="")
+        new = temporary.open("w+", encoding="utf-8", errors=NO_TEXT, newline="")
         try:
             new.write(_contents(file))
             new.flush()

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.growing_table import GrowingTable, written_again
+from bmask_slam.graph.files.growing_table import NO_TEXT, GrowingTable, written_again
 from bmask_slam.graph.files.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
@@ -78,7 +78,8 @@ class OpenFiles:
         with self.undone_on_error():
             for name, names in columns.items():
                 self._files[name] = self.tables[name] = GrowingTable(path / name, names, mode)
-            self._files[LOG] = self.log = LogFile(path / LOG, mode=f"{mode}+", encoding="utf-8")
+            log = LogFile(path / LOG, mode=f"{mode}+", encoding="utf-8", errors=NO_TEXT)
+            self._files[LOG] = self.log = log
             self._directory = _descriptor(path)
 
     def follow(self) -> Path:

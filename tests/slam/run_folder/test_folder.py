@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import shutil
 from pathlib import Path
 
 import pytest
 from small_layouts import SMALL_LAYOUTS, write_small
 
+from bmask_slam.events import Event, EventKind
 from bmask_slam.graph.errors import InputError
 from bmask_slam.run_folder import folder as folder_module
 from bmask_slam.run_folder.folder import FILES, RunFolder
@@ -114,6 +117,20 @@ def test_an_unknown_stage_is_a_bug(tmp_path: Path) -> None:
     result = FrameResult(3, 0.1, TrackingStatus.OK, None, stage_ms={"tea": 1.5})
     with RunFolder(tmp_path) as folder, pytest.raises(ValueError, match="tea_ms"):
         folder.write_frame(result)
+
+
+def test_a_path_that_is_no_text_is_written_in_log_and_events(tmp_path: Path, capsys) -> None:
+    """A name in Latin-1, as old systems wrote it, of a map or a folder that was given."""
+    name = os.fsdecode(b"caf\xe9")
+    with RunFolder(tmp_path / name) as folder:
+        for _ in range(2):
+            folder.write_events([Event(0, 0.0, EventKind.CALIBRATION, f"found by {name}")])
+            logging.getLogger("bmask_slam").info("found by %s", name)
+            shutil.rmtree(tmp_path / name, ignore_errors=True)
+            path = folder.path
+    for file in ("log.txt", "events.csv"):
+        assert (path / file).read_text().count("found by caf\\udce9") == 2
+    assert "Traceback" not in capsys.readouterr().err
 
 
 def test_a_file_is_replaced_completely_or_not_at_all(tmp_path: Path) -> None:
