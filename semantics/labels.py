@@ -42,13 +42,18 @@ def label_set(classes: tuple[str, ...] | list[str]) -> LabelSet:
     return LabelSet((BACKGROUND, *classes))
 
 
+def is_shipped_name(name: str) -> bool:
+    """Whether a label set is given by the bare name of one in ``data/labels``, not by a file."""
+    return re.fullmatch(r"[\w-]+", name) is not None
+
+
 def read_label_set(name: str) -> LabelSet:
     """Read a set from a file with one class a line, or by the bare name of one in ``data/labels``.
 
     Raises:
         InputError: no such file, no class in it, or a class on two lines.
     """
-    path = data_path("labels", f"{name}.txt") if re.fullmatch(r"[\w-]+", name) else Path(name)
+    path = data_path("labels", f"{name}.txt") if is_shipped_name(name) else Path(name)
     cure = "give one class name a line"
     classes = [line for _, line in read_lines(path, cure)]
     if not 0 < len(classes) <= MAX_CLASSES:

@@ -100,6 +100,7 @@ def add_segmenter_arguments(parser: argparse.ArgumentParser, default: str) -> No
 
 def segmenter_options(arguments: argparse.Namespace, base: SegmenterOptions) -> SegmenterOptions:
     """The options with what was given on the command line; files by their absolute paths."""
+    from bmask_slam.semantics.labels import is_shipped_name
     from bmask_slam.semantics.segmenters.segmenter_table import written
 
     given = {name: getattr(arguments, name) for name in ("weights", "labels", "ray")}
@@ -109,6 +110,8 @@ def segmenter_options(arguments: argparse.Namespace, base: SegmenterOptions) -> 
         given[name] = path.absolute() if path else None
     if arguments.weights and Path(arguments.weights).is_file():
         given["weights"] = str(Path(arguments.weights).absolute())
+    if arguments.labels and not is_shipped_name(arguments.labels):
+        given["labels"] = str(Path(arguments.labels).absolute())
     return replace(base, **{name: value for name, value in given.items() if value is not None})
 
 

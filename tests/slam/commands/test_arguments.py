@@ -36,6 +36,14 @@ def test_files_are_given_by_their_absolute_paths() -> None:
     assert found.min_score == 0.3
 
 
+def test_a_label_set_is_a_file_or_the_name_of_a_shipped_one(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("mine.txt", "coco"):
+        (tmp_path / name).write_text("chair\n")
+    assert segmenter_options(parsed("--labels", "mine.txt"), BASE).labels == f"{tmp_path}/mine.txt"
+    assert segmenter_options(parsed("--labels", "coco"), BASE).labels == "coco"
+
+
 @pytest.mark.parametrize(
     "words",
     [["--segmenter", BASE.name], ["--segmenter", "truth"], ["--labels", "coco"]],
