@@ -209,8 +209,6 @@ def view_options(arguments: argparse.Namespace, window: bool) -> ViewOptions:
 
 def _foxglove(text: str | None) -> tuple[Path | None, int]:
     """The file, or the port, of --foxglove."""
-    from bmask_slam.graph.errors import InputError
-
     if text is None:
         return None, 0
     if text.lower().endswith(".mcap"):
