@@ -104,10 +104,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ.setdefault(name, value)
     keep_little_memory()
     try:
-        arguments = make_parser().parse_args(argv)
-        _check_memory()
-        with _terminations(), _console_log(arguments):
-            code = int(arguments.handler(arguments))
+        code = _run(argv)
         if code == 128 + signal.SIGHUP:  # the terminal was closed: nobody reads on
             _discard_output()
         return code
@@ -127,10 +124,24 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 128 + ended.number
 
 
+def _run(argv: Sequence[str] | None) -> int:
+    """Run one command, and write all that it has printed: the end of Python would hide errors."""
+    try:
+        arguments = make_parser().parse_args(argv)
+    except SystemExit:  # after --help
+        print(end="", flush=True)
+        raise
+    _check_memory()
+    with _terminations(), _console_log(arguments):
+        code = int(arguments.handler(arguments))
+    print(end="", flush=True)
+    return code
+
+
 def _discard_output() -> None:
     """Let the rest of what was printed go nowhere: the end of Python would fail to write it."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    for stream in (sys.stdout, sys.stderr):
+    for stream in filter(None, (sys.stdout, sys.stderr)):
         os.dup2(nowhere, stream.fileno())
 
 
@@ -165,7 +176,10 @@ def _after_refusal(error: Exception) -> int:
         return 128 + signal.SIGHUP
     if error.errno not in CURES:
         raise error
-    return _fail(f"{error.filename or 'output'}: {error.strerror}; {CURES[error.errno]}")
+    status = _fail(f"{error.filename or 'output'}: {error.strerror}; {CURES[error.errno]}")
+    if error.filename is None and CURES[error.errno] is SPACE:
+        _discard_output()
+    return status
 
 
 class _Terminated(BaseException):

@@ -364,3 +364,20 @@ def test_a_closed_output_pipe_is_not_an_error(sequence: Path) -> None:
     command = f"{sys.executable} -m bmask_slam info {sequence} | true; exit ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("words", ["info {sequence}", "--help", "run --help"])
+@pytest.mark.parametrize(
+    ("output", "status", "error"),
+    [
+        ("| true", 141, ""),
+        ("> /dev/full", 1, "error: output: No space left on device; free some space\n"),
+    ],
+)
+def test_output_that_cannot_be_written(sequence, words: str, output: str, status, error) -> None:
+    """Python keeps what is printed to a pipe or file until the end, unless it is told not to."""
+    command = f"{sys.executable} -m bmask_slam {words.format(sequence=sequence)} {output}"
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
+    script = ["bash", "-c", f"{command}; exit ${{PIPESTATUS[0]}}"]
+    done = subprocess.run(script, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (status, error)
