@@ -33,12 +33,24 @@ def whole_file(path: Path) -> Iterator[Path]:
     if path.is_dir() and not path.is_symlink():
         raise _is_folder(path)
     temporary = _temporary(path)
-    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    with _named(path, temporary):
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        try:
+            yield temporary
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _named(path: Path, temporary: Path) -> Iterator[None]:
+    """In errors of the block, the file that is to be in place of the temporary one."""
     try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        if str(error.filename).startswith(str(temporary)):
+            error.filename = f"{path}{str(error.filename).removeprefix(str(temporary))}"
+        raise
 
 
 @contextmanager
@@ -59,13 +71,14 @@ def writing(path: Path, cure: str = "free some space, or change its permissions"
 def whole_folder(path: Path) -> Iterator[Path]:
     """An empty temporary folder beside ``path``; else as ``whole_file``."""
     temporary = _temporary(path)
-    temporary.mkdir()
-    try:
-        yield temporary
-        remove(path)
-        os.replace(temporary, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with _named(path, temporary):
+        temporary.mkdir()
+        try:
+            yield temporary
+            remove(path)
+            os.replace(temporary, path)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
 
 
 def open_plain(path: Path, mode: str) -> IO[Any]:

@@ -48,6 +48,19 @@ def test_after_an_error_the_old_content_is_there(tmp_path: Path) -> None:
     assert (folder / "old").exists()
 
 
+def test_an_error_names_the_file_and_not_the_temporary_one(tmp_path: Path) -> None:
+    """As of a folder in which nothing may be written, which root cannot try."""
+    missing = tmp_path / "missing" / "a.txt"
+    for make in (whole_file, whole_folder):
+        with pytest.raises(FileNotFoundError) as caught, make(missing):
+            pass
+        assert caught.value.filename == str(missing)
+    with pytest.raises(NotADirectoryError) as caught, whole_folder(tmp_path / "b") as temporary:
+        (temporary / "file").write_text("")
+        (temporary / "file" / "c").write_text("")
+    assert caught.value.filename == str(tmp_path / "b" / "file" / "c")
+
+
 def test_permissions_are_those_of_any_new_file(tmp_path: Path) -> None:
     (tmp_path / "plain").write_text("")
     with whole_file(tmp_path / "whole") as temporary:
