@@ -35,13 +35,19 @@ class RerunTransport:
         """Show it as asked for.
 
         Raises:
-            InputError: Rerun is not installed, it finds no window's program, or the port is taken.
+            InputError: Rerun is not installed, it finds no window's program, the port is taken, or
+                the recording cannot be written.
         """
         self._rr: Any = import_extra("rerun", "the viewer", "view")
         self._viewer: WebViewer | None = None
         self._stream = self._rr.RecordingStream(f"bmask-slam {name}")
         if options.record is not None:
-            self._stream.save(str(options.record))
+            try:
+                self._stream.save(str(options.record))
+            except RuntimeError as error:
+                reason = str(error).partition(", path")[0]
+                cure = "change the folder's permissions, or choose another place"
+                raise InputError(f"{options.record}: {reason}; {cure}") from error
         elif options.serve:
             import rerun_cli  # noqa: PLC0415 - a part of Rerun
 

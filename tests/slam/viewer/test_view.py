@@ -88,6 +88,12 @@ def test_a_recording_that_is_a_folder_is_refused(tmp_path) -> None:
             Scene("a", options)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="a folder in which nobody may write")
+def test_a_recording_that_cannot_be_written_is_refused() -> None:
+    with pytest.raises(InputError, match=r"^/proc/run\.rrd: .*; change the folder's permissions"):
+        Scene("test", ViewOptions(record=Path("/proc/run.rrd")))
+
+
 def test_what_cannot_be_shown_leaves_an_earlier_recording(tmp_path, capsys) -> None:
     file = tmp_path / "a.rrd"
     file.write_text("precious")
