@@ -33,6 +33,7 @@ from bmask_slam.commands.sequences import add_convert, add_download, add_info, a
 from bmask_slam.commands.show import add_doctor, add_film, add_report, add_view
 from bmask_slam.graph.errors import InputError, did_you_mean, one_line
 from bmask_slam.graph.extras import import_extra
+from bmask_slam.graph.files.whole_file import DISK_FULL
 from bmask_slam.runtime.memory import is_out_of_memory, keep_little_memory, memory_limit_bytes
 from bmask_slam.runtime.stop_request import SIGNALS
 
@@ -79,7 +80,7 @@ SPACE, RIGHTS, DESCRIPTORS, DEVICE, PLACE = (
     "a file is where a folder has to be, choose another place",
 )
 CURES = {
-    **{errno.ENOSPC: SPACE, errno.EDQUOT: SPACE, errno.EFBIG: SPACE},
+    **dict.fromkeys(DISK_FULL, SPACE),
     **{errno.EACCES: RIGHTS, errno.EPERM: RIGHTS, errno.EROFS: RIGHTS},
     **{errno.EMFILE: DESCRIPTORS, errno.ENFILE: DESCRIPTORS},
     **{errno.EIO: DEVICE, errno.ESTALE: DEVICE, errno.ENODEV: DEVICE},
@@ -176,7 +177,8 @@ def _after_refusal(error: Exception) -> int:
         return 128 + signal.SIGHUP
     if error.errno not in CURES:
         raise error
-    status = _fail(f"{error.filename or 'output'}: {error.strerror}; {CURES[error.errno]}")
+    name = error.filename2 or error.filename or "output"
+    status = _fail(f"{name}: {error.strerror}; {CURES[error.errno]}")
     if error.filename is None and CURES[error.errno] is SPACE:
         _discard_output()
     return status

@@ -18,6 +18,7 @@ from typing import IO, Any
 from bmask_slam.graph.errors import InputError
 
 PREFIX = ".part-"
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
@@ -44,12 +45,19 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _named(path: Path, temporary: Path) -> Iterator[None]:
-    """In errors of the block, the file that is to be in place of the temporary one."""
+    """In errors of the block, the file that is to be in place of the temporary one.
+
+    A full disk names none when it is written to.
+    """
     try:
         yield
     except OSError as error:
-        if str(error.filename).startswith(str(temporary)):
-            error.filename = f"{path}{str(error.filename).removeprefix(str(temporary))}"
+        for which in ("filename", "filename2"):
+            name = str(getattr(error, which))
+            if name.startswith(str(temporary)):
+                setattr(error, which, f"{path}{name.removeprefix(str(temporary))}")
+        if error.filename is None and error.errno in DISK_FULL:
+            error.filename = str(path)
         raise
 
 

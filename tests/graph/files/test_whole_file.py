@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import resource
+import shutil
 from pathlib import Path
 
 import pytest
@@ -59,6 +61,21 @@ def test_an_error_names_the_file_and_not_the_temporary_one(tmp_path: Path) -> No
         (temporary / "file").write_text("")
         (temporary / "file" / "c").write_text("")
     assert caught.value.filename == str(tmp_path / "b" / "file" / "c")
+
+
+def test_a_full_disk_names_the_file_that_it_did_not_take(tmp_path: Path) -> None:
+    """The system does not say it when it writes, and copying names the file that is read."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    path, source = tmp_path / "a", tmp_path / "source"
+    source.write_bytes(bytes(2000))
+    for make in (Path.write_bytes, lambda to, data: shutil.copyfile(source, to)):
+        with pytest.raises(OSError, match="File too large") as caught, whole_file(path) as part:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+            try:
+                make(part, bytes(2000))
+            finally:
+                resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert str(path) in (caught.value.filename, caught.value.filename2)
 
 
 def test_permissions_are_those_of_any_new_file(tmp_path: Path) -> None:
