@@ -51,6 +51,10 @@ def _named(path: Path, temporary: Path) -> Iterator[None]:
     """
     try:
         yield
+    except InputError as error:
+        if str(temporary) not in str(error):
+            raise
+        raise InputError(str(error).replace(str(temporary), str(path))) from error
     except OSError as error:
         for which in ("filename", "filename2"):
             name = str(getattr(error, which))

@@ -78,6 +78,12 @@ def test_a_full_disk_names_the_file_that_it_did_not_take(tmp_path: Path) -> None
         assert str(path) in (caught.value.filename, caught.value.filename2)
 
 
+def test_a_refusal_names_the_file_and_not_the_temporary_one(tmp_path: Path) -> None:
+    path = tmp_path / "map"
+    with pytest.raises(InputError, match=rf"^{path}: cannot be written"), whole_file(path) as part:
+        raise InputError(f"{part}: cannot be written")
+
+
 def test_permissions_are_those_of_any_new_file(tmp_path: Path) -> None:
     (tmp_path / "plain").write_text("")
     with whole_file(tmp_path / "whole") as temporary:
