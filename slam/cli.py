@@ -116,13 +116,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 128 + signal.SIGPIPE
     except (OSError, MemoryError, ImportError, RuntimeError) as error:
         return _after_refusal(error)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 128 + signal.SIGINT
-    except _Terminated as ended:
-        with suppress(OSError):
-            print(f"ended by {ended.number.name}", file=sys.stderr)
-        return 128 + ended.number
+    except (KeyboardInterrupt, _Terminated) as ended:
+        return _after_signal(ended)
 
 
 def _run(argv: Sequence[str] | None) -> int:
@@ -168,6 +163,8 @@ def _check_memory() -> None:
 
 def _after_refusal(error: Exception) -> int:
     """The exit status after what the machine refuses; another error is raised again."""
+    if isinstance(error.__cause__, (KeyboardInterrupt, _Terminated)):  # while a library loaded
+        return _after_signal(error.__cause__)
     if is_out_of_memory(error):
         return _fail(MEMORY)
     if not isinstance(error, OSError):
@@ -189,6 +186,16 @@ class _Terminated(BaseException):
 
     def __init__(self, number: signal.Signals) -> None:
         self.number = number
+
+
+def _after_signal(ended: KeyboardInterrupt | _Terminated) -> int:
+    """The exit status after a signal, which is said."""
+    text, number = "interrupted", signal.SIGINT
+    if isinstance(ended, _Terminated):
+        text, number = f"ended by {ended.number.name}", ended.number
+    with suppress(OSError):
+        print(text, file=sys.stderr)
+    return 128 + number
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -339,6 +340,21 @@ def test_a_file_in_the_place_of_a_folder(capsys, sequence: Path, tmp_path: Path,
     assert re.search(rf"error: {file}\S*: .*; a file is where a folder has to be", errors)
 
 
+def test_a_signal_while_a_library_loads(capsys, monkeypatch) -> None:
+    """GTSAM's loader turns what is raised in it into an ImportError."""
+
+    def load(arguments: object) -> int:
+        try:
+            signal.raise_signal(number)
+        except BaseException as error:
+            raise ImportError("initialization failed") from error
+        return 0
+
+    monkeypatch.setattr(sequences, "_info", load)
+    for number, said in ((signal.SIGINT, "interrupted"), (signal.SIGTERM, "ended by SIGTERM")):
+        assert call(capsys, "info", "x") == (128 + number, "", f"{said}\n")
+
+
 def test_unknown_errors_keep_their_traceback(monkeypatch) -> None:
     def fail(arguments: object) -> int:
         raise ProcessLookupError(3, "No such process")
@@ -349,8 +365,6 @@ def test_unknown_errors_keep_their_traceback(monkeypatch) -> None:
 
 
 def test_a_stopped_run_reports_it(capsys, monkeypatch, sequence: Path) -> None:
-    import signal
-
     import bmask_slam.offline.runner
 
     summary = RunSummary(Path("r"), [], 7, 2, signal.SIGTERM)
