@@ -105,12 +105,12 @@ def _workstation(arguments: argparse.Namespace) -> int:
     from bmask_slam.live.network.server import WorkstationServer
     from bmask_slam.runtime.stop_request import StopRequest
 
+    if not 0 <= arguments.port < 1 << 16:
+        raise InputError(f"--port {arguments.port}: give one from 0, any that is free, to 65535")
     path = arguments.token_file or default_token_file()
     if not path.exists():
         make_token(path)
         print(f"a new token is in {path}; copy it to the robot", file=sys.stderr)
-    if not 0 <= arguments.port < 1 << 16:
-        raise InputError(f"--port {arguments.port}: no port")
     server = WorkstationServer(arguments.host, arguments.port, read_token(path))
     print(f"listening on {arguments.host}:{server.port}; Ctrl-C ends it", flush=True)
     with closing(server), StopRequest() as stop:

@@ -190,6 +190,8 @@ def test_every_shipped_configuration_runs(capsys, sequence: Path, tmp_path: Path
         (["run", "seq", "--set", "tracking.min_inliers=-3"], "= -3 is negative; give 0 or more"),
         (["run", "seq", "--set", "graph.relinearize_skip=0"], "= 0: must be at least 1"),
         (["live", "seq", "--max-frames", "0"], "--max-frames 0: must be a whole number"),
+        (["live", "seq", "--map", "--map-frames", "nan"], "--map-frames nan: must be 0 or more"),
+        (["workstation", "--port", "99999", "--token-file", "t"], "--port 99999: give one from 0"),
         (
             ["evaluate-segmentation", "--data", "x", "--images", "seq", "--plot", "none/a.png"],
             "none/a.png: the folder none is not there",
