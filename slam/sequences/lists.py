@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -214,7 +214,8 @@ def read_associations(path: Path) -> tuple[ImageList, ImageList]:
     lines = _lines(path, 4, "timestamp rgb timestamp depth")
     first = [(n, finite_number(c[0], f"{path}:{n}"), c[1]) for n, c in lines]
     second = [(n, finite_number(c[2], f"{path}:{n}"), c[3]) for n, c in lines]
-    if first[0][2].startswith("depth") and second[0][2].startswith("rgb"):
+    names = [str(PurePosixPath(rows[0][2])) for rows in (first, second)]  # of ./rgb/0.png too
+    if names[0].startswith("depth") and names[1].startswith("rgb"):
         logger.info("%s: depth comes first in the lines", path)
         first, second = second, first
     return _image_list(path, first), _image_list(path, second)

@@ -149,6 +149,13 @@ def test_associations(folder, depth_first):
     assert sequence.pairs.depth_files == before.pairs.depth_files[:4]
 
 
+def test_associations_of_depth_first_by_names_that_begin_with_the_folder_itself(folder):
+    rows = (f"{k / 10} ./depth/{k}.png {k / 10} ./rgb/{k}.png" for k in range(4))
+    (folder / "associations.txt").write_text("\n".join(rows))
+    (folder / "rgb.txt").unlink()
+    assert open_sequence(folder).pairs.rgb_files == tuple(folder / f"rgb/{k}.png" for k in range(4))
+
+
 def test_grey_and_alpha_images_are_expanded(folder):
     cv2.imwrite(str(folder / "rgb/4.png"), np.full((24, 32), 77, np.uint8))
     cv2.imwrite(str(folder / "rgb/5.png"), np.full((24, 32, 4), (1, 2, 3, 128), np.uint8))
