@@ -35,7 +35,7 @@ from bmask_slam.graph.errors import InputError, did_you_mean, one_line
 from bmask_slam.graph.extras import import_extra
 from bmask_slam.graph.files.whole_file import DISK_FULL
 from bmask_slam.runtime.memory import is_out_of_memory, keep_little_memory, memory_limit_bytes
-from bmask_slam.runtime.stop_request import SIGNALS
+from bmask_slam.runtime.stop_request import SIGNALS, is_terminal_closed
 
 ADDED = (
     add_run,
@@ -169,7 +169,7 @@ def _after_refusal(error: Exception) -> int:
         return _fail(MEMORY)
     if not isinstance(error, OSError):
         raise error
-    if error.errno == errno.EIO and error.filename is None:  # the terminal was closed
+    if error.errno == errno.EIO and is_terminal_closed():
         _discard_output()
         return 128 + signal.SIGHUP
     if error.errno not in CURES:

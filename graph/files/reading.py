@@ -57,7 +57,8 @@ def read_bytes(path: Path, cure: str, limit: int = MAX_BYTES) -> bytes:
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; {cure}") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
-        if getattr(error, "errno", None) in NOT_THE_FILE:
+        if isinstance(error, OSError) and error.errno in NOT_THE_FILE:
+            error.filename = error.filename or str(path)  # which reading does not say
             raise
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: cannot be read ({reason}); {cure}") from error

@@ -312,6 +312,7 @@ def test_render_options_reach_the_renderer(capsys, monkeypatch, tmp_path: Path) 
         (OSError(28, "No space left on device", "f"), 1, "error: f: No space left on device"),
         (OSError(28, "No space left", "read", None, "written"), 1, "error: written: No space left"),
         (OSError(13, "Permission denied", "f"), 1, "error: f: Permission denied; change its perm"),
+        (OSError(5, "Input/output error"), 1, "error: output: Input/output error; the disk or the"),
         (OSError(24, "Too many open files"), 1, "error: output: Too many open files; raise the"),
         (OSError(30, "Read-only file system", "f"), 1, "error: f: Read-only file system; change"),
         (OSError(12, "Cannot allocate memory"), 1, "error: out of memory; free some"),
@@ -340,6 +341,16 @@ def test_a_file_in_the_place_of_a_folder(capsys, sequence: Path, tmp_path: Path,
     status, _, errors = call(capsys, *given)
     assert status == 1
     assert re.search(rf"error: {file}\S*: .*; a file is where a folder has to be", errors)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a file that cannot be read")
+def test_a_disk_that_fails_is_named_with_the_file(capsys, sequence: Path) -> None:
+    """It passed for a terminal that was closed, after which nothing is said."""
+    (sequence / "rgb.txt").unlink()
+    (sequence / "rgb.txt").symlink_to("/proc/self/mem")  # its first page is nobody's
+    status, _, errors = call(capsys, "info", sequence)
+    expected = f"error: {sequence}/rgb.txt: Input/output error; the disk or the connection"
+    assert (status, errors[: len(expected)]) == (1, expected)
 
 
 def test_a_signal_while_a_library_loads(capsys, monkeypatch) -> None:
