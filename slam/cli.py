@@ -35,7 +35,12 @@ from bmask_slam.graph.errors import InputError, did_you_mean, one_line
 from bmask_slam.graph.extras import import_extra
 from bmask_slam.graph.files.whole_file import DISK_FULL
 from bmask_slam.runtime.memory import is_out_of_memory, keep_little_memory, memory_limit_bytes
-from bmask_slam.runtime.stop_request import SIGNALS, is_terminal_closed
+from bmask_slam.runtime.standard_streams import (
+    discard_output,
+    is_terminal_closed,
+    open_missing_streams,
+)
+from bmask_slam.runtime.stop_request import SIGNALS
 
 ADDED = (
     add_run,
@@ -104,15 +109,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, value in WAITING.items():
         os.environ.setdefault(name, value)
     keep_little_memory()
+    open_missing_streams()
     try:
         code = _run(argv)
         if code == 128 + signal.SIGHUP:  # the terminal was closed: nobody reads on
-            _discard_output()
+            discard_output()
         return code
     except InputError as error:
         return _fail(str(error))
     except BrokenPipeError:  # `bmask-slam info ... | head`: nobody reads on
-        _discard_output()
+        discard_output()
         return 128 + signal.SIGPIPE
     except (OSError, MemoryError, ImportError, RuntimeError) as error:
         return _after_refusal(error)
@@ -132,13 +138,6 @@ def _run(argv: Sequence[str] | None) -> int:
         code = int(arguments.handler(arguments))
     print(end="", flush=True)
     return code
-
-
-def _discard_output() -> None:
-    """Let the rest of what was printed go nowhere: the end of Python would fail to write it."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    for stream in filter(None, (sys.stdout, sys.stderr)):
-        os.dup2(nowhere, stream.fileno())
 
 
 def _console_log(arguments: argparse.Namespace) -> AbstractContextManager[None]:
@@ -170,14 +169,14 @@ def _after_refusal(error: Exception) -> int:
     if not isinstance(error, OSError):
         raise error
     if error.errno == errno.EIO and is_terminal_closed():
-        _discard_output()
+        discard_output()
         return 128 + signal.SIGHUP
     if error.errno not in CURES:
         raise error
     name = error.filename2 or error.filename or "output"
     status = _fail(f"{name}: {error.strerror}; {CURES[error.errno]}")
     if error.filename is None and CURES[error.errno] is SPACE:
-        _discard_output()
+        discard_output()
     return status
 
 

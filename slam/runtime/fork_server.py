@@ -26,6 +26,7 @@ from typing import NoReturn
 
 from bmask_slam.runtime.forked_process import NUMBER, ForkedProcess
 from bmask_slam.runtime.memory import keep_little_memory
+from bmask_slam.runtime.standard_streams import copy_of_stream, has_stream
 from bmask_slam.runtime.stop_request import SIGNALS
 
 logger = logging.getLogger(__name__)
@@ -62,8 +63,8 @@ class ForkServer:
             self._process = subprocess.Popen(  # nosec B603 # this module, by number of descriptor
                 [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"],
                 stdin=other_end.fileno(),
-                stdout=None if _has_stream(1) else subprocess.DEVNULL,
-                stderr=None if _has_stream(2) else subprocess.DEVNULL,
+                stdout=None if has_stream(1) else subprocess.DEVNULL,
+                stderr=None if has_stream(2) else subprocess.DEVNULL,
                 env=dict(environment),
                 process_group=0,  # Ctrl-C in a terminal must reach only the owner
             )
@@ -93,7 +94,7 @@ class ForkServer:
         try:
             passed.append(_in_memory(pickle.dumps(start)))
             for number in STANDARD_STREAMS:
-                passed.append(_open_stream(number))
+                passed.append(copy_of_stream(number))
             socket.send_fds(self._control, [b"\0"], [*passed, *descriptors])
         finally:
             for number in passed:
@@ -140,19 +141,6 @@ if IS_SUPPORTED:
 def server_pid() -> int | None:
     """Process id of this process's server, if there is one."""
     return None if _Shared.server is None else _Shared.server.pid
-
-
-def _has_stream(number: int) -> bool:
-    """Whether this program was started with it; else its number may be any file's by now."""
-    return (sys.__stdin__, sys.__stdout__, sys.__stderr__)[number] is not None
-
-
-def _open_stream(number: int) -> int:
-    """A copy of a standard stream; of nothing, where the owner has none."""
-    if _has_stream(number):
-        with suppress(OSError):  # it is closed meanwhile
-            return os.dup(number)
-    return os.open(os.devnull, os.O_WRONLY)
 
 
 def _in_memory(data: bytes) -> int:

@@ -5,10 +5,8 @@ SIGHUP comes when a terminal is closed or a remote login is lost.
 
 from __future__ import annotations
 
-import errno
 import logging
 import signal
-import sys
 import threading
 from types import FrameType
 from typing import Any
@@ -52,18 +50,3 @@ class StopRequest:
     def _restore(self) -> None:
         while self._previous:
             signal.signal(*self._previous.popitem())
-
-
-def is_terminal_closed() -> bool:
-    """Whether output goes to a terminal that is gone: it cannot even be asked for its settings."""
-    import termios  # noqa: PLC0415 - Unix only
-
-    for stream in filter(None, (sys.stdout, sys.stderr)):
-        try:
-            termios.tcgetattr(stream.fileno())
-        except termios.error as error:
-            if error.args[0] == errno.EIO:
-                return True
-        except (OSError, ValueError):  # it is no file
-            continue
-    return False

@@ -409,3 +409,13 @@ def test_output_that_cannot_be_written(sequence, words: str, output: str, status
     script = ["bash", "-c", f"{command}; exit ${{PIPESTATUS[0]}}"]
     done = subprocess.run(script, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (status, error)
+
+
+@pytest.mark.parametrize("closed", ["2>&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_a_command_without_standard_streams(sequence: Path, tmp_path: Path, closed: str) -> None:
+    """As some services start programs: a bar has nowhere to go, and no file takes their numbers."""
+    out = tmp_path / "out"
+    command = f"{sys.executable} -m bmask_slam convert {sequence} {out} --max-frames 1 {closed}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (out / "camera.yaml").is_file()
