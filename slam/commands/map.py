@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bmask_slam.commands.arguments import (
+    SEGMENTER_OPTIONS,
     Commands,
     add_mesh_voxel_argument,
     add_output_arguments,
@@ -107,7 +108,7 @@ def _masks(arguments: argparse.Namespace) -> SegmenterOptions | None:
     from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 
     if arguments.segmenter is None:
-        if arguments.masks is None and arguments.weights is None:
+        if all(getattr(arguments, name) is None for name in SEGMENTER_OPTIONS):
             return None
         arguments.segmenter = "light" if arguments.masks is None else "precomputed"
     return segmenter_options(arguments, SegmenterOptions())

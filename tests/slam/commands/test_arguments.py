@@ -14,6 +14,7 @@ from bmask_slam.commands.arguments import (
     chosen_config,
     segmenter_options,
 )
+from bmask_slam.commands.map import _masks
 from bmask_slam.labelling.config import SemanticsConfig
 
 BASE = SemanticsConfig().segmenter
@@ -51,3 +52,21 @@ def test_a_label_set_is_a_file_or_the_name_of_a_shipped_one(tmp_path: Path, monk
 def test_what_is_given_counts_as_given_where_it_is_the_default(words: list[str]) -> None:
     assert not chosen_config(parsed(*words)).is_default
     assert chosen_config(parsed()).is_default
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ([], None),
+        (["--weights", "w"], "light"),
+        (["--masks", "m"], "precomputed"),
+        (["--ray", "auto"], "light"),
+        (["--proposals", "p.onnx"], "light"),
+        (["--labels", "coco"], "light"),
+        (["--segmenter", "truth", "--ray", "auto"], "truth"),
+    ],
+)
+def test_a_map_takes_no_option_of_a_segmenter_without_one(words: list[str], name: str) -> None:
+    """They did not count where neither --segmenter, --masks nor --weights was given."""
+    found = _masks(parsed(*words))
+    assert (found and found.name) == name
