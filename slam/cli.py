@@ -38,7 +38,7 @@ from bmask_slam.runtime.memory import is_out_of_memory, keep_little_memory, memo
 from bmask_slam.runtime.standard_streams import (
     discard_output,
     is_terminal_closed,
-    open_missing_streams,
+    prepare_streams,
 )
 from bmask_slam.runtime.stop_request import SIGNALS
 
@@ -109,7 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, value in WAITING.items():
         os.environ.setdefault(name, value)
     keep_little_memory()
-    open_missing_streams()
+    prepare_streams()
     try:
         code = _run(argv)
         if code == 128 + signal.SIGHUP:  # the terminal was closed: nobody reads on

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 from contextlib import suppress
@@ -24,11 +25,14 @@ def copy_of_stream(number: int) -> int:
     return os.open(os.devnull, os.O_WRONLY)
 
 
-def open_missing_streams() -> None:
+def prepare_streams() -> None:
     """Let those that this program was started without lead nowhere.
 
-    Else the next files that are opened would have their numbers, and get what libraries print.
+    Else the next files that are opened would have their numbers, and get what libraries print. A
+    letter that the output's encoding does not have is printed as its code.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
     if None not in (sys.stdin, sys.stdout, sys.stderr):
         return
     while (nowhere := os.open(os.devnull, os.O_RDWR)) <= LAST:

@@ -419,3 +419,16 @@ def test_a_command_without_standard_streams(sequence: Path, tmp_path: Path, clos
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert (out / "camera.yaml").is_file()
+
+
+@pytest.mark.parametrize("words", [["info", "büro"], ["info", "--json", "büro"]])
+def test_output_that_holds_no_such_letter_has_its_code(tmp_path: Path, words: list[str]) -> None:
+    """As with PYTHONIOENCODING=ascii; of a path that is no text with UTF-8 too."""
+    make_sequence(tmp_path / "büro")
+    command = [sys.executable, "-m", "bmask_slam", *words]
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"b.(xfc|u00fc)ro", done.stdout)
