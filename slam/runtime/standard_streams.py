@@ -46,7 +46,9 @@ def discard_output() -> None:
     """Let the rest of what was printed go nowhere: the end of Python would fail to write it."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in filter(None, (sys.stdout, sys.stderr)):
-        os.dup2(nowhere, stream.fileno())
+        with suppress(OSError, ValueError):  # it is no file, as in a notebook
+            os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
 
 
 def is_terminal_closed() -> bool:

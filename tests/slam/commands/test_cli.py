@@ -310,6 +310,7 @@ def test_render_options_reach_the_renderer(capsys, monkeypatch, tmp_path: Path) 
     [
         (InputError("a file:\nwrong"), 1, "error: a file: wrong\n"),
         (OSError(28, "No space left on device", "f"), 1, "error: f: No space left on device"),
+        (OSError(28, "No space left on device"), 1, "error: output: No space left on device"),
         (OSError(28, "No space left", "read", None, "written"), 1, "error: written: No space left"),
         (OSError(13, "Permission denied", "f"), 1, "error: f: Permission denied; change its perm"),
         (OSError(5, "Input/output error"), 1, "error: output: Input/output error; the disk or the"),
