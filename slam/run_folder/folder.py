@@ -81,8 +81,9 @@ GROWING = {FRAMES: COLUMNS, EVENTS: EVENT_COLUMNS}
 
 
 def trajectory_files(run: Path) -> list[Path]:
-    """trajectory.txt of a run folder, then the file of each other map segment."""
-    return [run / "trajectory.txt", *sorted(run.glob("trajectory_segment_*.txt"))]
+    """trajectory.txt of a run folder, then the file of each other map segment, by number."""
+    others = run.glob("trajectory_segment_*.txt")
+    return [run / "trajectory.txt", *sorted(others, key=lambda file: (len(file.name), file.name))]
 
 
 class RunFolder:

@@ -13,7 +13,7 @@ from small_layouts import SMALL_LAYOUTS, write_small
 from bmask_slam.events import Event, EventKind
 from bmask_slam.graph.errors import InputError
 from bmask_slam.run_folder import folder as folder_module
-from bmask_slam.run_folder.folder import FILES, RunFolder
+from bmask_slam.run_folder.folder import FILES, RunFolder, trajectory_files
 from bmask_slam.run_folder.open_files import free_run_path
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
@@ -209,3 +209,10 @@ def test_files_of_others_with_names_like_those_of_a_run_stay(tmp_path: Path) -> 
         (tmp_path / name).write_text("")
     with RunFolder(tmp_path, overwrite=True):
         assert [p.name for p in tmp_path.glob("trajectory*")] == [foreign]
+
+
+def test_files_of_segments_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    names = ["trajectory.txt", *(f"trajectory_segment_{k}.txt" for k in (1, 2, 10, 11))]
+    for name in reversed(names):
+        (tmp_path / name).touch()
+    assert [file.name for file in trajectory_files(tmp_path)] == names
