@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.geometry import make_pose, so3_exp, so3_log
 from bmask_slam.graph.trajectory import Trajectory
 
@@ -87,9 +87,7 @@ def smooth(measured: Trajectory, information: Array) -> Trajectory:
         As many poses; those of fewer than ``MIN_FRAMES`` frames, or of frames without information,
         are returned unchanged.
     """
-    finite = np.isfinite(information).all(axis=(1, 2), keepdims=True)
-    sizes = np.linalg.eigvalsh(np.where(finite, information, 0.0))
-    known = np.flatnonzero(sizes[:, 0] > LEAST_KNOWN * sizes[:, -1])
+    known = np.flatnonzero(are_known(information))
     if len(measured) < MIN_FRAMES or not len(known):
         return measured
     found = np.linalg.inv(information[known])
@@ -101,6 +99,13 @@ def smooth(measured: Trajectory, information: Array) -> Trajectory:
     except (LinAlgError, ValueError) as error:  # not a reason to lose the poses
         logger.warning("the trajectory is not smoothed: %s", error)
         return measured
+
+
+def are_known(information: Array) -> Mask:
+    """Which (N,) of inverse covariances (N, 6, 6) can be inverted: they are finite and definite."""
+    finite = np.isfinite(information).all(axis=(1, 2), keepdims=True)
+    sizes = np.linalg.eigvalsh(np.where(finite, information, 0.0))
+    return np.asarray(sizes[:, 0] > LEAST_KNOWN * sizes[:, -1])
 
 
 def _in_stretches(frames: Frames) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import carried_along, inverse, make_pose, so3_exp, so3_log
-from bmask_slam.graph.trajectory_smoothing import MotionNoise
+from bmask_slam.graph.trajectory_smoothing import MotionNoise, are_known
 from bmask_slam.tracking.results import FrameResult, Velocity
 
 NOISE = MotionNoise(turn=4.0, shift=0.2)
@@ -44,11 +44,12 @@ class PoseFilter:
 
     def filtered(self, result: FrameResult) -> FrameResult:
         """A frame's result with its filtered pose and velocity, where that is known."""
-        T, covariance = result.T_world_camera, result.covariance
-        if T is None or covariance is None or not result.status.by_image:
+        T, known = result.T_world_camera, result.information
+        by_image = result.status.by_image
+        if T is None or known is None or not by_image or not are_known(known[None])[0]:
             self._stamp_s = np.nan
             return result
-        measured = self._noise.covariances(covariance)
+        measured = self._noise.covariances(np.asarray(np.linalg.inv(known), float))
         step_s = result.timestamp_s - self._stamp_s
         goes_on = result.segment == self._segment and 0 < step_s < LONGEST_STEP_S  # False for NaN
         self._segment, self._stamp_s = result.segment, result.timestamp_s

@@ -81,6 +81,8 @@ def test_the_filter_moves_with_the_map() -> None:
         {"segment": 1},
         {"timestamp_s": 60 * STEP_S + LONGEST_STEP_S},
         {"information": None},
+        {"information": np.diag([1e-6, 1e5, 1e6, 1e7, 1e8, 1e9])},
+        {"information": np.full((6, 6), np.nan)},
         {"status": TrackingStatus.DEAD_RECKONING},
         {"T_world_camera": None, "status": TrackingStatus.LOST},
     ],
