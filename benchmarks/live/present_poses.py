@@ -18,9 +18,9 @@ import numpy as np
 
 from benchmarks.paths import SHARED
 from bmask_slam import LiveSlam, open_sequence
+from bmask_slam.calibration.motion import twists_at
 from bmask_slam.evaluation.ate_rpe import evaluate_trajectory
 from bmask_slam.evaluation.reference import read_reference
-from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices
 from bmask_slam.tracking.pose_filter import PoseFilter
@@ -28,8 +28,6 @@ from bmask_slam.tracking.results import FrameResult
 
 HEAD = ("poses", "ATE mm", "RPE/s mm", "RPE/frame mm", "rad/s", "m/s")
 STEP_S = 1 / 30
-MAX_GAP_S = 0.05
-"""Between frames whose poses give a velocity."""
 
 
 class RecordedFilter(PoseFilter):
@@ -68,27 +66,17 @@ def path_of(results: list[FrameResult]) -> Trajectory:
     return Trajectory(np.array([r.timestamp_s for r in known]), poses)
 
 
-def twists(path: Trajectory, before: int) -> Array:
-    """Velocities (N, 6) from the pose before each, and with 1 to the one after; NaN in gaps."""
-    T, stamps_s = path.poses_world_camera, path.timestamps_s
-    rows = np.arange(1, len(path) - 1)
-    step_s = stamps_s[rows + before] - stamps_s[rows - 1]
-    found = np.full((len(path), 6), np.nan)
-    found[rows] = se3_log(inverse(T[rows - 1]) @ T[rows + before]) / step_s[:, None]
-    found[rows[step_s > (1 + before) * MAX_GAP_S]] = np.nan
-    return found
-
-
 def velocity_errors(kept: RecordedFilter, reference: Trajectory) -> list[tuple[float, float]]:
     """RMS in rad/s and m/s of differences of tracked poses, and of the filter."""
     path = path_of(kept.tracked)
     at = nearest_indices(reference.timestamps_s, path.timestamps_s)
-    true = twists(Trajectory(path.timestamps_s, reference.poses_world_camera[at]), 1)
+    truth = Trajectory(path.timestamps_s, reference.poses_world_camera[at])
+    true, T = twists_at(truth, path.timestamps_s)[1:], path.poses_world_camera
+    differences = se3_log(inverse(T[:-1]) @ T[1:]) / np.diff(path.timestamps_s)[:, None]
     by_stamp = {r.timestamp_s: r.velocity for r in kept.given_out}
-    velocities = [by_stamp[s] for s in path.timestamps_s.tolist()]
+    velocities = [by_stamp[s] for s in path.timestamps_s[1:].tolist()]
     own = np.array([np.full(6, np.nan) if v is None else v.twist for v in velocities])
-    both = [found - true for found in (twists(path, 0), own)]
-    usable = np.isfinite(np.hstack(both)).all(axis=1)
+    both, usable = [found - true for found in (differences, own)], np.isfinite(own).all(axis=1)
     return [
         (float(np.sqrt((e[usable, :3] ** 2).mean())), float(np.sqrt((e[usable, 3:] ** 2).mean())))
         for e in both

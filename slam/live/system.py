@@ -79,7 +79,7 @@ class LiveSystem(SlamSystem):
         self.covered = ""
         self._measured: deque[Measurements] = deque()
         self._own_factors, self._located = -1, 0
-        self._filter = PoseFilter() if config.smooth_trajectory else None
+        self._filter = PoseFilter()
         self.label_names = (segmenter or NoSegmenter).labels.names
         self.mask_listeners: list[Callable[[Masks], None]] = []
         with ExitStack() as undo:
@@ -106,7 +106,7 @@ class LiveSystem(SlamSystem):
         result = super().process(frame, features if seen is None else None)
         if found is not None:
             found.add_frame(frame, self._keyframe(result))
-        return self._filter.filtered(result) if self._filter is not None else result
+        return self._filter.filtered(result) if self.config.smooth_trajectory else result
 
     def _found_covered(self, camera: Camera, text: str) -> None:
         """Leave it out, if the camera is not only told about; a map that grows begins anew."""
@@ -189,8 +189,8 @@ class LiveSystem(SlamSystem):
             return
         parent = self.remote.world.keyframes[parent_id]
         T_after = parent.T_world_camera @ T_parent_reference
-        for follower in (tracker, self._filter) if self._filter else (tracker,):
-            follower.follow_map(T_before, T_after)
+        tracker.follow_map(T_before, T_after)
+        self._filter.follow_map(T_before, T_after)
         tracker.refer_to(parent)
         tracker.segment = parent.segment
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.geometry import carried_along, inverse, make_pose, so3_exp, so3_log
+from bmask_slam.graph.geometry import carried_along, make_pose, so3_exp, so3_log
 from bmask_slam.graph.trajectory_smoothing import MotionNoise, are_known
 from bmask_slam.tracking.results import FrameResult, Velocity
 
@@ -101,7 +101,7 @@ class PoseFilter:
 
     def _velocity(self) -> Velocity:
         """In the camera's frame."""
-        G = _blocks(inverse(self._T)[:3, :3])[6:, 6:]
+        G = _blocks(self._T[:3, :3].T)[6:, 6:]
         return Velocity(G @ self._rates, G @ self._P[6:, 6:] @ G.T)
 
 

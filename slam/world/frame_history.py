@@ -169,7 +169,7 @@ class FrameHistory:
         return [
             Trajectory(entries["timestamp_s"][rows], entries["T_keyframe_camera"][rows])
             for keyframe_id, rows in self._by_keyframe()
-            if self._resolve(keyframe_id, np.eye(4))[0] == NO_KEYFRAME
+            if self._owner(keyframe_id) == NO_KEYFRAME
         ]
 
     def _by_keyframe(self) -> Iterator[tuple[int, Ints]]:
