@@ -9,7 +9,7 @@ import pytest
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.beliefs.movability import MovabilityConfig, MovabilityFilter, read_priors
-from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.labels import label_set, read_label_set
 
 IDS = np.array([3, 2000])
 
@@ -104,3 +104,21 @@ def test_bad_priors_are_refused(tmp_path: Path, text: str, message: str) -> None
 def test_bad_configuration_is_refused(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):
         MovabilityConfig(**bad)
+
+
+def test_every_animal_of_coco_moves_by_itself() -> None:
+    names = read_label_set("coco")
+    animals = [
+        "bird",
+        "cat",
+        "dog",
+        "horse",
+        "sheep",
+        "cow",
+        "elephant",
+        "bear",
+        "zebra",
+        "giraffe",
+    ]
+    priors = read_priors("movability").of(names)
+    assert (priors[[names.names.index(animal) for animal in animals]] > 0.5).all()
