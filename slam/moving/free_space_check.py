@@ -44,8 +44,10 @@ class FreeSpaceCheckConfig:
     farthest depth in the window is within that distance. Points beyond ``max_depth_m`` are not
     judged. ``views`` keyframes are kept, at least ``interval_s`` apart. The motion of a keypoint
     that is unknown is taken from its ``neighbours`` within ``neighbour_px``, if their depths differ
-    by less than ``same_depth`` times the depth. A thing stands still if each of two or more views
-    that are at least ``still_s`` apart in time found ``still_share`` of it where it is.
+    by less than ``same_depth`` times the depth. Most of a thing that moves is in its own place for
+    a while: only views at least ``static_s`` before or after find one static. It stands still if
+    each of two or more views that are at least ``still_s`` apart in time found ``still_share`` of
+    it where it is.
     """
 
     margin_m: float = 0.1
@@ -57,6 +59,7 @@ class FreeSpaceCheckConfig:
     neighbours: int = 5
     neighbour_px: float = 30.0
     same_depth: float = 0.05
+    static_s: float = 0.4
     still_s: float = 1.0
     still_share: float = 0.9
 

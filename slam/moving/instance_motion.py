@@ -13,7 +13,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.moving.depth_view_buffer import PosedView
 from bmask_slam.moving.feature_motion import NEAREST_M
-from bmask_slam.moving.free_space_check import FreeSpaceCheck
+from bmask_slam.moving.free_space_check import FreeSpaceCheck, PointMotions
 from bmask_slam.moving.keyframe_masks import KeyframeMasks, Surface
 from bmask_slam.semantics.beliefs.movability import MovabilityPriors, log_odds
 from bmask_slam.semantics.tracks.instance_track import Sighting, Track
@@ -55,7 +55,14 @@ def motion_state(
     if check.stood_still(by_full_view, apart_s, at_least):
         return MotionState.STILL
     motions = check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
-    point_motions = check.agree(motions)
+    found = _of_most(check.agree(motions), at_least)
+    if found is MotionState.STATIC:  # in a shorter time most of what moves stays in its own place
+        found = _of_most(check.agree(motions[np.abs(apart_s) >= check.config.static_s]), at_least)
+    return found
+
+
+def _of_most(point_motions: PointMotions, at_least: int) -> MotionState:
+    """The motion of an instance by that of its points (N,)."""
     known = np.count_nonzero(point_motions)
     if known < at_least:
         return MotionState.UNKNOWN

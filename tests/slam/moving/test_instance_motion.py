@@ -8,8 +8,9 @@ import pytest
 from bmask_slam.graph.arrays import Array, Floats
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import se3_exp, transform
-from bmask_slam.moving.free_space_check import FreeSpaceCheck, FreeSpaceCheckConfig
-from bmask_slam.moving.instance_motion import InstanceMotion
+from bmask_slam.moving.depth_view_buffer import PosedView
+from bmask_slam.moving.free_space_check import FreeSpaceCheck, FreeSpaceCheckConfig, depth_view
+from bmask_slam.moving.instance_motion import InstanceMotion, MotionState, motion_state
 from bmask_slam.moving.keyframe_masks import KeyframeMasks
 from bmask_slam.semantics.beliefs.movability import read_priors
 from bmask_slam.semantics.beliefs.pixel_assignment import assign_pixels
@@ -61,6 +62,32 @@ def test_a_keyframe_observes_an_unoccluded_position(
     column, row = CAMERA.project(np.array([[0.5, 0.2, 2.0]]))[0] / 4
     depth_m[int(row) - 1 : int(row) + 2, int(column) - 1 : int(column) + 2] = there_m
     assert instance_motion().shows(masks(depth_m), track(np.array(centre))) is shown
+
+
+@pytest.mark.parametrize(
+    ("apart_s", "shift_m", "found"),
+    [
+        (0.1, 0.08, MotionState.UNKNOWN),  # 0.8 m/s: five sixths of its place were its own
+        (0.1, 0.0, MotionState.UNKNOWN),
+        (0.5, 0.0, MotionState.STATIC),
+        (0.5, 0.4, MotionState.MOVING),
+        (0.1, 0.4, MotionState.MOVING),
+    ],
+)
+def test_what_moves_is_not_called_static_while_it_is_in_its_own_place(
+    apart_s: float, shift_m: float, found: MotionState
+) -> None:
+    """A body half a metre wide, 2 m away and in front of a wall at 4 m."""
+    x, y = np.meshgrid(np.linspace(-0.25, 0.25, 40), np.linspace(-0.5, 0.5, 40))
+    body = np.stack([x, y, np.full_like(x, 2.0)], axis=-1).reshape(-1, 3)
+    depth_m = np.full(SIZE, 4.0, np.float32)
+    left, right = (int(CAMERA.project(np.array([[e, 0, 2.0]]))[0, 0]) for e in (-0.25, 0.25))
+    depth_m[:, left - 3 : right + 3] = 2.0
+    check = FreeSpaceCheck(CAMERA, CAMERA.noise_of_depth(0.1), FreeSpaceCheckConfig())
+    view = depth_view(depth_m, check.config.window_px)
+    before = [PosedView(0, 10.0, view, view, np.eye(4))]
+    moved = body + np.array([shift_m, 0, 0])
+    assert motion_state(moved, 10.0 + apart_s, before, check, 20) is found
 
 
 def test_a_view_without_depth_observes_nothing() -> None:
