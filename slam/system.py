@@ -245,7 +245,8 @@ class SlamSystem(SavedSystem):
     @stage("semantics")
     def _label(self, frame: Frame, keyframe: Keyframe, static: StaticFeatures) -> None:
         self.moving_objects.store_keyframe(keyframe, static)
-        self.semantics.observe(frame, keyframe)
+        first = self.map.world.in_segment(keyframe.segment) == [keyframe]
+        self.semantics.observe(frame, keyframe, urgent=first or self.moving_objects.crowd(static))
 
     def _join_segments(self, tracked: Tracked) -> Tracked:
         """Search the frame in other map segments; if it is recognised, they are joined."""

@@ -3,6 +3,11 @@
 A network that works beside tracking takes longer than a frame. What it finds is used ``LAG`` frames
 after the keyframe and not earlier, however soon it comes: tracking goes on in the meantime, and a
 run that is repeated gives the same bytes, on one processor as on more.
+
+Those of two kinds of keyframes are urgent, and used before the next frame is tracked. That has no
+other landmarks than those of the keyframe that begins a map segment; and where most of an image
+moves, the few static landmarks are soon outnumbered by those that a keyframe makes on people.
+Either way the camera would follow a person.
 """
 
 from __future__ import annotations
@@ -92,15 +97,19 @@ class MaskRequests:
         """A frame begins; some may be due with it."""
         self._requests = [replace(r, frames_left=r.frames_left - 1) for r in self._requests]
 
-    def add(self, keyframe_id: int, frame: Frame, segmenter: Segmenter) -> None:
+    def add(
+        self, keyframe_id: int, frame: Frame, segmenter: Segmenter, urgent: bool = False
+    ) -> None:
         """Ask for the masks of a frame that became a keyframe.
 
-        They are due at once, unless the segmenter can work beside its caller.
+        They are due with the next frame if ``urgent``, and at once if the segmenter cannot work
+        beside its caller.
         """
-        lag = LAG if isinstance(segmenter, EarlySegmenter) else 0
+        lag = 0 if not isinstance(segmenter, EarlySegmenter) else 1 if urgent else LAG
         self._requests.append(MaskRequest(keyframe_id, frame.rgb, frame.name, lag))
 
     def take(self, everything: bool = False) -> Iterator[MaskRequest]:
         """Those that are due, or all, each once."""
-        while self._requests and (everything or self._requests[0].frames_left <= 0):
-            yield self._requests.pop(0)
+        due = [r for r in self._requests if everything or r.frames_left <= 0]
+        self._requests = [r for r in self._requests if r not in due]
+        yield from due

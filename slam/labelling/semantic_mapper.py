@@ -80,12 +80,15 @@ class SemanticMapper:
         """Whether there is more than the label "unknown"."""
         return len(self.names) > 1
 
-    def observe(self, frame: Frame, keyframe: Keyframe) -> None:
-        """Follow the map's changes and ask for the masks of a keyframe; see ``use_masks``."""
+    def observe(self, frame: Frame, keyframe: Keyframe, urgent: bool = False) -> None:
+        """Follow the map's changes and ask for a keyframe's masks, which ``use_masks`` uses.
+
+        ``urgent``: before the next frame is tracked.
+        """
         self.follow_map()
         if len(self.segmenter.labels) > 1:
             self.await_masks(keyframe, kept_depth(frame.depth_m))
-            self._requests.add(keyframe.id, frame, self.segmenter)
+            self._requests.add(keyframe.id, frame, self.segmenter, urgent)
             self.use_masks()
 
     def begin_frame(self) -> None:

@@ -288,7 +288,7 @@ class _RemoteSemantics(SemanticMapper):
         super().__init__(system.camera, system.config.semantics, system.map)
         self._system = system
 
-    def observe(self, frame: Frame, keyframe: Keyframe) -> None:
+    def observe(self, frame: Frame, keyframe: Keyframe, urgent: bool = False) -> None:
         """Send the requests; does not wait for answers."""
         if self._system.segmenter is not None:
             self._system.segmenter.request(ImageToSegment(keyframe.id, frame.rgb, frame.name))

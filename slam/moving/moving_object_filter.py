@@ -88,7 +88,7 @@ class MovingObjectFilter:
         views = self.keyframe_views.posed(self._camera_tracker.segment, self._map)
         predicted = self._camera_tracker.prediction()
         static = self.static_features_at(frame, features, predicted, views)
-        doubted = static.moving.sum() > self.config.doubt_share * len(features)
+        doubted = self.crowd(static)
         settled = max(self.config.min_static, self.config.settled_share * len(features))
         if predicted is not None and doubted and static.static_count < settled:
             found = self._camera_tracker.preview(features)
@@ -96,6 +96,10 @@ class MovingObjectFilter:
                 return replace(static, features=features, mostly_moving=True)
             static = self.static_features_at(frame, features, found, views)
         return self._replenished(frame, features, static, views)
+
+    def crowd(self, static: StaticFeatures) -> bool:
+        """Whether most features of a frame seem to move."""
+        return bool(static.moving.sum() > self.config.doubt_share * len(static.moving))
 
     def static_features_at(
         self, frame: Frame, features: Features, T_world_camera: Array | None, views: list[PosedView]

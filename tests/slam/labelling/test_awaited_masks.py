@@ -47,7 +47,8 @@ def test_masks_are_asked_for_lag_frames_after_they_were_begun() -> None:
     for done, frame in enumerate(FRAMES[:8], 1):
         system.process(frame)
         assert segmenter.begun == names(done)
-        assert segmenter.asked == names(max(done - LAG, 0))
+        urgent = min(done - 1, 1)  # the first one, which begins the map
+        assert segmenter.asked == names(max(done - LAG, urgent))
     system.finish()
     assert segmenter.asked == names(8)
 
@@ -107,6 +108,20 @@ def test_a_keyframe_without_masks_does_not_keep_others_from_theirs(caplog) -> No
     assert [r.getMessage() for r in caplog.records if "has no masks" in r.getMessage()] == [
         f"keyframe 2 has no masks: {FRAMES[2].name}: broken"
     ]
+
+
+def test_the_masks_of_a_keyframe_in_a_crowd_are_used_before_the_next_frame(monkeypatch) -> None:
+    segmenter, crowded = Beside(), []
+    system = system_with(segmenter)
+    system.process(FRAMES[0])
+    system.process(FRAMES[1])
+    monkeypatch.setattr(system.moving_objects, "crowd", lambda static: crowded.append(1) or True)
+    system.process(FRAMES[2])
+    system.process(FRAMES[3])
+    assert crowded
+    assert segmenter.asked == [FRAMES[0].name, FRAMES[2].name]
+    system.finish()
+    assert sorted(segmenter.asked) == names(4)
 
 
 def test_requests_come_in_order_and_once() -> None:
