@@ -60,7 +60,8 @@ class LiveMap(SensorInput):
     def catch_up(self, waiting: float = math.inf) -> None:
         """Apply the other processes' results; wait until at most ``waiting`` keyframes are pending.
 
-        The wait ends after ``MAX_MAP_WAIT_S``, unless the camera is being estimated.
+        The wait ends after ``MAX_MAP_WAIT_S``, unless the camera is being estimated, for at
+        most ``remote_calibration.WAIT_S``.
         """
         self._system.wait_for_map(waiting, MAX_MAP_WAIT_S)
 

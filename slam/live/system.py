@@ -206,8 +206,8 @@ class LiveSystem(SlamSystem):
     def wait_for_map(self, waiting: float, timeout_s: float) -> None:
         """Catch up until at most ``waiting`` keyframes wait for the map, or until the timeout.
 
-        With a finite ``waiting`` it also waits while the dense map would drop a keyframe, and, for
-        as long as that takes, for an estimate of the camera.
+        With a finite ``waiting`` it also waits while the dense map would drop a keyframe, and,
+        however long the timeout, for an estimate of the camera (`RemoteCalibration.is_awaited`).
         """
         deadline_s = time.monotonic() + timeout_s
         self.catch_up()
@@ -219,7 +219,7 @@ class LiveSystem(SlamSystem):
 
     def _is_estimating(self, waiting: float) -> bool:
         found = self.calibration
-        return found is not None and found.adopts and waiting < np.inf and found.busy
+        return found is not None and waiting < np.inf and found.is_awaited
 
     def _is_behind(self, waiting: float) -> bool:
         is_full = waiting < np.inf and self.dense is not None and self.dense.full

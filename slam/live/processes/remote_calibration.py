@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from dataclasses import dataclass
 
 from bmask_slam.calibration.edge_delay import MAX_DELAY_S
@@ -27,6 +28,8 @@ logger = logging.getLogger(__name__)
 NICENESS = 19
 READ_AHEAD = 10
 """Frames at most that a source has made with the camera before."""
+WAIT_S = 180.0
+"""Longest time that a source which can wait is kept waiting for an estimate; one takes seconds."""
 TARGET = "bmask_slam.live.processes.calibration_process:serve_calibration"
 
 
@@ -59,6 +62,7 @@ class RemoteCalibration:
         self._sends_colour = setup.looks_at_edges
         self._worker = Worker("calibration", TARGET, setup, NICENESS)
         self._frames = 0
+        self._waited_until_s = 0.0  # 0: no longer
         self._asked: int | None = None  # the number of the message that asks for a state
         self._last: list[DepthImage] = []
         self._pending: _Pending | None = None
@@ -68,6 +72,17 @@ class RemoteCalibration:
     def pid(self) -> int:
         """Process id."""
         return self._worker.pid
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether a source that can wait waits for an estimate: not for one that takes too long."""
+        if not (self.adopts and self.busy and self._waited_until_s):
+            return False
+        if time.monotonic() >= self._waited_until_s:
+            self._waited_until_s = 0.0
+            text = "the calibration has not answered for %.0f s; tracking goes on without it"
+            logger.warning(text, WAIT_S)
+        return bool(self._waited_until_s)
 
     def add_frame(self, frame: Frame, keyframe: Keyframe | None) -> None:
         """Add a tracked frame, and the keyframe that it has become, if it has."""
@@ -116,6 +131,7 @@ class RemoteCalibration:
             self._due *= 2
             mapper.save_state()
             self.busy, self._asked = True, mapper.worker.sent
+            self._waited_until_s = time.monotonic() + WAIT_S
         if self._asked is not None:
             self._begin_estimate(mapper, self._asked)
         for message in self._worker.receive():

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
+import time
 from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
@@ -228,6 +231,19 @@ def test_a_calibration_that_has_ended_is_no_process() -> None:
         assert slam._system.calibration is not None
         slam._system.calibration.end()
         assert {"map"} == slam.processes().keys()
+
+
+def test_a_recording_does_not_wait_for_a_calibration_that_hangs(monkeypatch, caplog) -> None:
+    monkeypatch.setattr(remote_calibration, "WAIT_S", 1.0)
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(calibrate="auto")) as slam:
+        calibration = slam._system.calibration
+        os.kill(calibration.pid, signal.SIGSTOP)
+        calibration._due = 0
+        for _ in range(2):
+            begin_s = time.monotonic()
+            slam.catch_up(waiting=0)
+            assert time.monotonic() - begin_s < LONG_S / 2
+        assert caplog.text.count("has not answered for 1 s; tracking goes on") == 1
 
 
 def test_an_unknown_choice_is_refused() -> None:
