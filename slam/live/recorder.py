@@ -63,12 +63,15 @@ class Recorder:
     def _guarded(self, write: Callable[[], None]) -> None:
         try:
             write()
-        except OSError as error:
+        except Exception as error:  # no file is worth the tracking
             self.unwritten += 1
             if time.monotonic() - self._message_s > MESSAGE_S:
                 self._message_s = time.monotonic()
-                text = "%s; tracking goes on, free some space or change permissions before it ends"
-                logger.error(text, error)
+                if isinstance(error, OSError | InputError):
+                    cure = "free some space or change permissions before it ends"
+                    logger.error("%s; tracking goes on, %s", error, cure)
+                else:
+                    logger.exception("a file of the run was not written; tracking goes on")
 
     def _write(
         self,

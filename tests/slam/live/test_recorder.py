@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live import recorder
 from bmask_slam.live.health import Health
@@ -22,7 +23,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     return clock
 
 
-def written(clock: SimpleNamespace, cost_s: float, error: OSError | None = None) -> list[float]:
+def written(clock: SimpleNamespace, cost_s: float, error: Exception | None = None) -> list[float]:
     """Times at which a trajectory is written if this takes so long; 300 s at 10 Hz."""
     times: list[float] = []
 
@@ -56,3 +57,11 @@ def test_a_long_trajectory_is_written_less_often(clock: SimpleNamespace) -> None
 def test_a_full_disk_is_not_retried_sooner(clock: SimpleNamespace) -> None:
     times = written(clock, 0.0, OSError(28, "No space left on device"))
     assert np.diff(times) == pytest.approx(SNAPSHOT_S, abs=0.11)
+
+
+@pytest.mark.parametrize("error", [MemoryError(), ValueError("no such letter"), InputError("full")])
+def test_whatever_a_file_raises_tracking_goes_on_and_it_is_said(clock, error, caplog) -> None:
+    assert len(written(clock, 0.0, error)) > 50
+    texts = [record.getMessage() for record in caplog.records]
+    assert len(texts) == 5 and all("tracking goes on" in text for text in texts)
+    assert type(error).__name__ in caplog.text or str(error) in texts[0]
