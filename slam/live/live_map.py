@@ -128,8 +128,11 @@ class LiveMap(SensorInput):
         self._system.remote.extends = extends
 
     def save_map(self, path: Path) -> None:
-        """Let the map's process write a file as RUN/map; ``saved_maps`` says when it is there."""
-        self._system.remote.send(SaveMap(path))
+        """Let the map's process write a file as RUN/map; ``saved_maps`` says when it is there.
+
+        A relative path is one of the folder where the program is now; ``saved_maps`` has it whole.
+        """
+        self._system.remote.send(SaveMap(path.absolute()))
 
     def saved_maps(self) -> list[MapSaved]:
         """What was saved since the last call, or why not."""

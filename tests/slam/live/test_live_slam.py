@@ -102,6 +102,20 @@ def test_poses_are_filtered_as_the_camera_moves_unless_that_is_switched_off() ->
     assert error_m(np.array([result.T_world_camera for result in found[True]])) < 0.01
 
 
+def test_a_map_is_saved_where_the_program_is_when_it_asks(tmp_path, monkeypatch) -> None:
+    (tmp_path / "begin").mkdir()
+    (tmp_path / "later").mkdir()
+    monkeypatch.chdir(tmp_path / "begin")
+    with LiveSlam(CAMERA, CONFIG) as slam:
+        track_frames(slam, FRAMES[:3])
+        monkeypatch.chdir(tmp_path / "later")
+        slam.save_map(Path("map"))
+        saved = []
+        wait_until(lambda: slam.catch_up() or saved.extend(slam.saved_maps()) or saved)
+    assert [(s.path, s.failure) for s in saved] == [(tmp_path / "later" / "map", "")]
+    assert (tmp_path / "later" / "map").exists()
+
+
 def test_frames_after_the_end_are_refused_in_one_line(caplog) -> None:
     with LiveSlam(CAMERA, CONFIG) as slam:
         pass
