@@ -112,6 +112,7 @@ class Ros2Publisher:
         self._due_s = {"health": 0.0, "map": 0.0, "objects": 0.0, "grid": 0.0}
         self._grid = LiveGrid(self._T_map_world, self._grid_options)
         self._cloud = LiveCloud(self._T_map_world, self._voxel_m)
+        self._failed = False
 
     def _clear(self, stamp_s: float) -> None:
         """Another run has begun: what was published of the one before is none of its map."""
@@ -173,8 +174,21 @@ class Ros2Publisher:
         self._making = self._thread.submit(self._make_grid, stamp_s, run.keyframe_poses())
 
     def _make_grid(self, stamp_s: float, poses: dict[int, Array]) -> float:
-        """Publish grid and cloud; returns the time of the processor that they took."""
+        """Publish grid and cloud; returns the time of the processor that they took.
+
+        What fails is logged, the first time of a map.
+        """
         begin_s = time.thread_time()
+        try:
+            self._publish_dense(stamp_s, poses)
+        except Exception:  # it must end neither tracking nor the run
+            if not self._failed:
+                text = "a grid or cloud for ROS 2 could not be made; later ones are tried"
+                logger.warning(text, exc_info=True)
+            self._failed = True
+        return time.thread_time() - begin_s
+
+    def _publish_dense(self, stamp_s: float, poses: dict[int, Array]) -> None:
         found = self._grid.grid(poses)
         if found is not None:
             self._outputs.grid(stamp_s, *found)
@@ -182,7 +196,6 @@ class Ros2Publisher:
         cloud = self._cloud.cloud(poses)
         if cloud is not None:
             self._outputs.cloud(stamp_s, *cloud)
-        return time.thread_time() - begin_s
 
 
 def _with_low_priority() -> None:

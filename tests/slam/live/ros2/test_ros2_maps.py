@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import wait
 from types import SimpleNamespace
 from typing import Any
 
@@ -218,6 +219,33 @@ def test_maps_are_published_when_they_are_due(monkeypatch) -> None:
     for topic in ("map", "cloud"):
         name = f"/bmask_slam/{topic}"
         assert len(node.topics[name]) == counts[name] + 1
+
+
+def test_a_grid_that_cannot_be_made_is_one_warning_and_later_ones_are_made(
+    monkeypatch, caplog
+) -> None:
+    clock = SimpleNamespace(monotonic=lambda: clock.now_s, thread_time=lambda: 0.0, now_s=100.0)
+    monkeypatch.setattr(publisher, "time", clock)
+    node, run, make, calls = StandIn(), Run(), LiveGrid.grid, []
+
+    def failing(grid: LiveGrid, poses: dict[int, np.ndarray]) -> Any:
+        calls.append(poses)
+        if len(calls) <= 2:
+            raise MemoryError("a grid of kilometres")
+        return make(grid, poses)
+
+    monkeypatch.setattr(LiveGrid, "grid", failing)
+    publish = Ros2Publisher(node, Ros2Frames(), Robot(T_MAP_WORLD, True))
+    for k in range(4):
+        clock.now_s += publisher.GRID_S
+        publish(FrameResult(k, 5 + k, TrackingStatus.OK, np.eye(4), 0), run)
+        if k == 0:
+            run.listeners[0](4, room(2.02), np.zeros((len(room(2.02)), 3), np.uint8))
+        wait([publish._making])
+    assert len(calls) == 4 and node.topics["/bmask_slam/map"][-1].info.width > 20
+    assert len(node.topics["/bmask_slam/odometry"]) == 4
+    said = [r for r in caplog.records if r.levelname == "WARNING"]
+    assert len(said) == 1 and "could not be made; later ones are tried" in said[0].getMessage()
 
 
 def test_a_path_that_takes_long_is_published_less_often(monkeypatch) -> None:
