@@ -90,12 +90,14 @@ class StreamClock:
 
         It is earlier than the last one if that was wrong.
         """
-        of = self._streams[stream]
+        of, other = self._streams[stream], self._streams[1 - stream]
         if stamp_s == of.last_s:
             self._counts.duplicates += 1
             return None
         last, before = (of.last_s, of.epoch), of.before
-        if before is not None and _goes_on(before[0], of.last_s, stamp_s):
+        if before is not None and (
+            _goes_on(before[0], of.last_s, stamp_s) or _is_wrong_first(of, other, stamp_s)
+        ):
             self._take_back(of, *before)
         elif of.last_s - LATE_S <= stamp_s < of.last_s:
             self._counts.late += 1
@@ -107,6 +109,11 @@ class StreamClock:
         of.last_s = stamp_s
         of.placed_s = stamp_s + self._shifts_s[of.epoch]
         return of.placed_s
+
+    def doubts(self, stream: int) -> bool:
+        """Whether the last stamp is far from the one before; the next one says if it was wrong."""
+        before = self._streams[stream].before
+        return before is not None and bool(np.isfinite(before[0]))
 
     def _set_back(self, of: _Stream, stamp_s: float) -> None:
         of.epoch += 1
@@ -123,7 +130,10 @@ class StreamClock:
 
     def _take_back(self, of: _Stream, last_s: float, epoch: int) -> None:
         """The last stamp of a stream was wrong; it goes on from the one before."""
-        logger.warning("the stamp %.3f was wrong: stamps go on from %.3f", of.last_s, last_s)
+        how = (
+            f"stamps go on from {last_s:.3f}" if np.isfinite(last_s) else "the first of its stream"
+        )
+        logger.warning("the stamp %.3f was wrong: %s", of.last_s, how)
         of.epoch, of.before = epoch, None
         if max(stream.epoch for stream in self._streams) < len(self._shifts_s) - 1:
             self._counts.clock_jumps -= 1
@@ -133,6 +143,16 @@ class StreamClock:
 def _goes_on(before_s: float, last_s: float, stamp_s: float) -> bool:
     """Whether a stamp follows the one before the last, and not the last one, which is far away."""
     return 0 < stamp_s - before_s < min(abs(stamp_s - last_s), MAX_GAP_S)
+
+
+def _is_wrong_first(of: _Stream, other: _Stream, stamp_s: float) -> bool:
+    """Whether the only stamp of a stream so far is far ahead, and the other stream was not there.
+
+    If it was, the clock of both was set back.
+    """
+    is_first = of.before is not None and not np.isfinite(of.before[0])
+    was_alone = abs(other.placed_s - of.placed_s) > LATE_S
+    return is_first and was_alone and stamp_s < of.last_s - LATE_S
 
 
 class GapMeter:
@@ -237,6 +257,9 @@ class Pairer(Generic[T]):
         mutual = to_rgb[to_depth] == np.arange(len(rgb_s))
         mutual &= np.abs(partners_s - rgb_s) <= self._max_s
         mutual &= np.maximum(rgb_s, partners_s) <= min(self._heard_s)
+        for stream, stamps_s in ((RGB, rgb_s), (DEPTH, partners_s)):
+            if self.clock.doubts(stream):  # the last one may be left out
+                mutual &= stamps_s < self._heard_s[stream]
         found = np.flatnonzero(mutual)
         if not len(found):
             return []

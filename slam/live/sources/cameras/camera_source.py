@@ -63,25 +63,41 @@ class CameraSource(MeasuredSource, ABC):
         Raises:
             InputError: none came for ``silence_s``, or the device's library failed.
         """
-        clock, gaps = StreamClock(self.counts), GapMeter(self.counts)
-        index, heard_s = 0, time.monotonic()
+        gaps, index = GapMeter(self.counts), 0
         with self._lock:
             self._is_read = True
         try:
-            while not self._closed.is_set():
-                images = self._captured()
-                if images is None:
-                    self._check_silence(heard_s)
-                    self._closed.wait(RETRY_S)
-                    continue
-                heard_s = time.monotonic()
-                stamp_s = clock.map_stamp(RGB, images.stamp_s)
-                if stamp_s is not None:
-                    gaps.count(stamp_s)
-                    yield Frame(index, stamp_s, images.rgb, images.depth_m)
-                    index += 1
+            for stamp_s, images in self._stamped():
+                gaps.count(stamp_s)
+                yield Frame(index, stamp_s, images.rgb, images.depth_m)
+                index += 1
         finally:
             self._release_once()
+
+    def _stamped(self) -> Iterator[tuple[float, CameraImages]]:
+        """Images with the stamp on one clock; one that may be wrong waits for the next."""
+        clock, heard_s = StreamClock(self.counts), time.monotonic()
+        doubted: tuple[float, CameraImages] | None = None
+        while not self._closed.is_set():
+            images = self._captured()
+            if images is None:
+                if time.monotonic() - heard_s > self._silence_s:
+                    if doubted is not None:
+                        yield doubted
+                    raise InputError(self._silence())
+                self._closed.wait(RETRY_S)
+                continue
+            heard_s = time.monotonic()
+            stamp_s = clock.map_stamp(RGB, images.stamp_s)
+            if stamp_s is None:
+                continue
+            if doubted is not None and doubted[0] < stamp_s:
+                yield doubted
+            elif doubted is not None:
+                self.counts.late += 1
+            doubted = (stamp_s, images) if clock.doubts(RGB) else None
+            if doubted is None:
+                yield stamp_s, images
 
     def close(self) -> None:
         """End ``frames`` soon, or release the device if they have not begun; from any thread."""
@@ -117,11 +133,9 @@ class CameraSource(MeasuredSource, ABC):
     def _release(self) -> None:
         """Release the device."""
 
-    def _check_silence(self, heard_s: float) -> None:
-        if time.monotonic() - heard_s > self._silence_s:
-            raise InputError(
-                f"{self.name}: no frame for {self._silence_s:g} s; is the camera still plugged in?"
-            )
+    def _silence(self) -> str:
+        plugged = "is the camera still plugged in?"
+        return f"{self.name}: no frame for {self._silence_s:g} s; {plugged}"
 
 
 def chosen_camera(given: Path | None, own: Camera, where: str) -> Camera:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from itertools import islice
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -18,6 +19,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.live.sources.cameras.camera_source import fit_distortion
 from bmask_slam.live.sources.cameras.opencv_camera import OpenCvSource
 from bmask_slam.live.sources.cameras.realsense_camera import RealSenseSource
+from bmask_slam.live.sources.source_clock import SourceClock
 from bmask_slam.sequences.cameras import write_camera
 
 SILENCE_S = 0.3
@@ -160,6 +162,19 @@ def test_realsense_counts_incomplete_framesets(monkeypatch) -> None:
     counts = source.counts
     assert (counts.unpaired_rgb, counts.unpaired_depth) == (2, 1)
     assert (counts.duplicates, counts.clock_jumps) == (1, 1)
+
+
+@pytest.mark.parametrize("wrong_s", [0.0, 3600.0, 106.2, 98.0])
+def test_one_wrong_stamp_leaves_the_time_of_later_frames(monkeypatch, wrong_s: float) -> None:
+    stamps_s = [100 + k / 30 for k in range(20)]
+    given_s = [*stamps_s[:10], wrong_s, *stamps_s[11:]]
+    plug_in(monkeypatch, Device([frameset(k, 1000 * s) for k, s in enumerate(given_s)]))
+    stream, clock = RealSenseSource(silence_s=SILENCE_S).frames(), SourceClock()
+    found_s = []
+    for frame in islice(stream, 19):
+        found_s.append(clock.checked(frame.timestamp_s))
+        clock.used(found_s[-1])
+    assert found_s == pytest.approx([*stamps_s[:10], *stamps_s[11:]])
 
 
 def test_a_missing_realsense_is_refused(monkeypatch, tmp_path: Path) -> None:

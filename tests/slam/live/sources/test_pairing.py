@@ -9,6 +9,7 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.trajectory import associate_stamps
 from bmask_slam.live.sources.pairing import DEPTH, LATE_S, MAX_WAITING, RGB, Pair, Pairer
 from bmask_slam.live.sources.source import SourceCounts
+from bmask_slam.live.sources.source_clock import SourceClock
 
 
 def pairs_of(
@@ -145,6 +146,34 @@ def test_one_wrong_stamp_costs_one_or_two_pairs(wrong_s: float, streams, caplog)
     assert [pair.stamp_s for pair in known] == right_s[[pair.rgb for pair in known]].tolist()
     assert counts.clock_jumps == 0
     assert f"the stamp {wrong_s:.3f} was wrong" in caplog.text
+
+
+@pytest.mark.parametrize("wrong_s", [0.0, 1e4 + 3600, 1e4 + 6.2])
+def test_a_pair_with_one_wrong_stamp_does_not_move_later_ones(wrong_s: float) -> None:
+    stamps_s, clock = 1e4 + np.arange(40) / 30, SourceClock()
+    stamps_s[20] = wrong_s
+    used_s = []
+    for pair in pairs_of(stamps_s, stamps_s, np.tile([RGB, DEPTH], 40)):
+        used_s.append(clock.checked(pair.stamp_s))
+        clock.used(used_s[-1])
+    right_s = np.delete(stamps_s, 20).tolist()
+    assert used_s in (right_s, [s for s in right_s if s != stamps_s[21]])
+
+
+@pytest.mark.parametrize("ahead_s", [3600.0, 6.2])
+@pytest.mark.parametrize("stream", [RGB, DEPTH])
+@pytest.mark.parametrize("order", [[RGB, DEPTH], [DEPTH, RGB]])
+def test_a_wrong_first_stamp_costs_one_or_two_pairs(ahead_s: float, stream: int, order) -> None:
+    """Taken for a clock that was set back, it left the streams unpaired for ever."""
+    right_s, counts = 1e4 + np.arange(40) / 30, SourceCounts()
+    rgb_s, depth_s = right_s.copy(), right_s + 0.002
+    (rgb_s, depth_s)[stream][0] += ahead_s
+    pairs = pairs_of(rgb_s, depth_s, np.tile(order, 40), counts)
+    first = 40 - len(pairs)
+    assert first <= 2
+    assert [pair.rgb for pair in pairs] == [pair.depth for pair in pairs] == list(range(first, 40))
+    assert [pair.stamp_s for pair in pairs] == right_s[first:].tolist()
+    assert counts.clock_jumps == 0
 
 
 def test_gaps_are_counted_relative_to_the_usual_step() -> None:
