@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from bmask_slam.commands.arguments import (
@@ -162,6 +163,6 @@ def _summary(summary: RunSummary) -> str:
         name, frames = summary.stopped_by.name, summary.frames
         lines.append(f"Stopped by {name} after {frames} frames; all is saved")
     if summary.resumable:
-        lines.append(f"Go on with  bmask-slam run --resume {summary.folder}")
+        lines.append(f"Go on with  bmask-slam run --resume {quote(str(summary.folder))}")
     picture = summary.folder / "trajectory.png"
     return "\n".join([*lines, f"Run folder  {summary.folder}", f"Picture     {picture}"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import fields
 from pathlib import Path
+from shlex import quote
 
 from bmask_slam.commands.arguments import (
     Commands,
@@ -74,7 +75,7 @@ def _render(arguments: argparse.Namespace) -> int:
     config = RenderConfig(noise=not arguments.no_noise, **given)
     with counting_bar(arguments.quiet) as progress:
         folder = render_sequence(config, arguments.out, progress)
-    text = f"Sequence {folder}; next: bmask-slam run {folder}"
+    text = f"Sequence {folder}; next: bmask-slam run {quote(str(folder))}"
     print_result(arguments, folder, lambda: text, {"sequence": folder})
     return 0
 
@@ -128,7 +129,7 @@ def _convert(arguments: argparse.Namespace) -> int:
     with counting_bar(arguments.quiet) as progress:
         done = convert(source, arguments.out, arguments.camera, arguments.max_frames, progress)
     folder = arguments.out
-    text = f"{done}\nSequence {folder}; next: bmask-slam run {folder}"
+    text = f"{done}\nSequence {folder}; next: bmask-slam run {quote(str(folder))}"
     print_result(arguments, folder, lambda: text, {"sequence": folder, **vars(done)})
     return 0
 

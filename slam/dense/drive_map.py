@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Literal
 
 import numpy as np
@@ -117,7 +118,8 @@ def voxel_map(run: Path, resolution_m: float) -> tuple[VoxelMap, str]:
     """
     saved, depths = read_saved_map(run), run / "dense" / "depth"
     if not depths.is_dir():
-        raise InputError(f"{depths}: no dense map here; make it with bmask-slam map {run}")
+        cure = f"make it with bmask-slam map {quote(str(run))}"
+        raise InputError(f"{depths}: no dense map here; {cure}")
     cloud = Run(run).dense_cloud
     T_map_world, frame = map_frame(saved, cloud)
     carver = VoxelCarver(resolution_m, T_map_world)

@@ -30,6 +30,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import cv2
@@ -137,7 +138,8 @@ class DenseFolder:
         """The dense map of a run with its own settings. Raises InputError if there is none."""
         path = run / "dense" / "settings.json"
         if not path.is_file():
-            raise InputError(f"{path}: no dense map here; make it with bmask-slam map {run}")
+            cure = f"make it with bmask-slam map {quote(str(run))}"
+            raise InputError(f"{path}: no dense map here; {cure}")
         return cls(run, _read_settings(path))
 
     @classmethod

@@ -10,6 +10,7 @@ import logging
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from shlex import quote
 
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.map_run import MapSummary, map_run, open_fusion
@@ -65,7 +66,7 @@ def merge_dense_maps(
 
 
 def _cure(run: Path) -> str:
-    return f"make it by: bmask-slam map {run}"
+    return f"make it by: bmask-slam map {quote(str(run))}"
 
 
 def _present_ids(source: Source, landmarks: LandmarkTable, ids: Ints) -> Ints:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 
@@ -133,7 +134,7 @@ def _read_source(path: Path, before: Source | None) -> Source:
     if not (path / MAP).is_file():
         cure = "run the sequence again, without --localise"
         if (path / CHECKPOINT).is_file():
-            cure = f"finish the run by: bmask-slam run --resume {path}"
+            cure = f"finish the run by: bmask-slam run --resume {quote(str(path))}"
         raise InputError(f"{path}: holds no map, so it is not a finished run; {cure}")
     state, camera = read_map(path)
     config = resolve(SystemConfig, path / CONFIG if (path / CONFIG).is_file() else None)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -61,7 +62,7 @@ def read_map(path: Path) -> tuple[Arrays, Camera]:
 def check_finished(run: Path) -> None:
     """Raises InputError for the folder of a run that was killed and can go on, so has no map."""
     if (run / CHECKPOINT).is_file() and not (run / MAP).is_file():
-        cure = f"finish the run by: bmask-slam run --resume {run}"
+        cure = f"finish the run by: bmask-slam run --resume {quote(str(run))}"
         raise InputError(f"{run}: is not finished, and has no map yet; {cure}")
 
 

@@ -6,6 +6,7 @@ import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -94,9 +95,8 @@ class Run:
         if not self.path.is_dir():
             raise InputError(f"{self.path}: no such folder; give the folder of a run")
         if not any((self.path / name).exists() for name in (*FILES, CHECKPOINT)):
-            raise InputError(
-                f"{self.path}: holds no run; make one by: bmask-slam run SEQUENCE --out {self.path}"
-            )
+            cure = f"make one by: bmask-slam run SEQUENCE --out {quote(str(self.path))}"
+            raise InputError(f"{self.path}: holds no run; {cure}")
 
     def __fspath__(self) -> str:
         return str(self.path)
@@ -259,7 +259,8 @@ class Run:
     def _dense_names(self) -> tuple[str, ...]:
         """Class names of the labels of the dense clouds."""
         path = self._file(f"{DENSE}/legend.json")
-        return tuple(read_json(path, dict[str, Any], f"bmask-slam map {self.path} makes it again"))
+        cure = f"bmask-slam map {quote(str(self.path))} makes it again"
+        return tuple(read_json(path, dict[str, Any], cure))
 
     def _marginals(self, landmark_ids: Ints) -> tuple[tuple[Ints, Array], tuple[Ints, Array]]:
         """Ids and covariances of the graph's keyframes, and of those landmarks that it has."""
@@ -284,14 +285,15 @@ class Run:
         if path.exists():
             return path
         if name.startswith(DENSE):
-            raise InputError(f"{path}: no such file; make it by: bmask-slam map {self.path}")
+            cure = f"make it by: bmask-slam map {quote(str(self.path))}"
+            raise InputError(f"{path}: no such file; {cure}")
         if (self.path / CHECKPOINT).exists():
-            cure = f"finish the run by: bmask-slam run --resume {self.path}"
+            cure = f"finish the run by: bmask-slam run --resume {quote(str(self.path))}"
             raise InputError(f"{path}: no such file yet; {cure}")
         raise InputError(f"{path}: no such file; {self._again(option)}")
 
     def _again(self, option: str = "") -> str:
         """The command that makes the run once more."""
-        sequence = self.sequence or "SEQUENCE"
-        words = ("bmask-slam run", str(sequence), option, f"--out {self.path} --overwrite")
+        sequence, out = (quote(str(path)) for path in (self.sequence or "SEQUENCE", self.path))
+        words = ("bmask-slam run", sequence, option, f"--out {out} --overwrite")
         return f"make it by: {' '.join(filter(None, words))}"

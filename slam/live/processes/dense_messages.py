@@ -6,6 +6,7 @@ import logging
 from collections.abc import Set
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 
@@ -200,8 +201,8 @@ class MapWritten:
     def log_missing(self, run: Path, has_images: bool) -> None:
         """Log how the map of a run is completed, if it has to be."""
         if self.failure:
-            logger.error("%s; bmask-slam map %s completes it", self.failure, run)
+            logger.error("%s; bmask-slam map %s completes it", self.failure, quote(str(run)))
         elif self.missing:
             cure = "adds" if has_images else "with their images as --sequence adds"
             text = "bmask-slam map %s %s the %d keyframes left out"
-            logger.warning(text, run, cure, len(self.missing))
+            logger.warning(text, quote(str(run)), cure, len(self.missing))

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from fake_run import make_sequence, true_trajectory
 from repository import ROOT
+from source_tree import SOURCES, location
 
 import bmask_slam.rendering.sequence
 from bmask_slam import cli
@@ -40,6 +41,12 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, s
     except SystemExit as end:
         status = int(end.code or 0)
     return status, *capsys.readouterr()
+
+
+def test_paths_in_commands_that_messages_show_are_quoted_for_the_shell() -> None:
+    shown = re.compile(r"f\"[^\"]*bmask-slam (?:run|map|--)[^\"{]*\{(?!quote\()")
+    found = [f"{location(p)}: {m[0]}" for p in SOURCES for m in shown.finditer(p.read_text())]
+    assert not found
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 from collections.abc import Callable
@@ -232,6 +233,19 @@ def test_a_killed_run_with_a_checkpoint_can_be_finished(tmp_path: Path) -> None:
     cure = rf"finish the run by: bmask-slam run --resume {tmp_path}/run"
     with pytest.raises(InputError, match=rf"landmarks\.ply: no such file yet; {cure}"):
         _ = found.landmarks
+
+
+def test_a_command_in_a_message_can_be_pasted_into_a_shell(tmp_path: Path) -> None:
+    (folder := tmp_path / "a room; ls").mkdir()
+    out = f"--out '{tmp_path}/a room; ls"
+    with pytest.raises(InputError, match=re.escape(f"bmask-slam run SEQUENCE {out}'")):
+        Run(folder)
+    found = killed(folder)
+    again = f"make it by: bmask-slam run '{folder}/seq' {out}/run' --overwrite"
+    with pytest.raises(InputError, match=re.escape(again)):
+        _ = found.landmarks
+    with pytest.raises(InputError, match=re.escape(f"by: bmask-slam map '{folder}/run'")):
+        _ = found.dense_cloud
 
 
 def test_an_incomplete_last_line_of_frames_is_skipped(known: Run) -> None:
