@@ -272,7 +272,8 @@ class LiveSlam(LiveMap):
             folder.write_events(self._system.events.take())
             lost = self._system.map.history.without_map()
             self._recorder.frames_apart(lost, max(self._system.segments(), default=-1) + 1)
-        rows = metrics.measure(self._system, self.options.reference, self._counters, 1)
+        arrived = health.frames + health.frames_refused + self.source_counts.broken
+        rows = metrics.measure(self._system, self.options.reference, self._counters, arrived)
         median_ms, p95_ms = self._meter.percentiles_ms()
         rows += [row("latency_ms_median", median_ms, "ms"), row("latency_ms_p95", p95_ms, "ms")]
         rows.append(row("frames_dropped", health.frames_dropped, "frames"))

@@ -59,7 +59,8 @@ def finish_run(run: ActiveRun) -> RunSummary:
     run.system.finish()
     give_back_memory()  # ISAM2's, which is not needed any more
     run.folder.write_events(run.system.events.take())
-    rows = measure(run.system, run.reference, counters, options.stride)
+    arrived = len(range(0, counters.next_index, options.stride))
+    rows = measure(run.system, run.reference, counters, arrived)
     checked = _camera_checked(run)
     rows += checked.rows
     if stopped_by is not None:

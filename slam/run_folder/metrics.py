@@ -65,12 +65,14 @@ class RunCounters:
 
 
 def measure(
-    system: System, reference: Trajectory | None, counters: RunCounters, stride: int
+    system: System, reference: Trajectory | None, counters: RunCounters, arrived: int
 ) -> list[Row]:
-    """The rows of metrics.json; errors only where there is a reference that covers the run."""
+    """The rows of metrics.json; errors only where there is a reference that covers the run.
+
+    ``arrived``: frames that the source gave, the broken ones among them too.
+    """
     trajectory, statistics = system.trajectory(), system.statistics()
-    given = len(range(0, counters.next_index, stride))
-    rows = [row("tracked_share", len(trajectory) / max(given, 1), "1")]
+    rows = [row("tracked_share", len(trajectory) / max(arrived, 1), "1")]
     if reference is not None:
         try:
             errors = evaluate_trajectory(trajectory, reference).rows

@@ -273,6 +273,17 @@ def test_the_frame_of_a_first_keyframe_that_crashes_the_map_is_saved_apart(
     assert read_tum(apart).timestamps_s.tolist() == [FRAMES[0].timestamp_s]
 
 
+def test_broken_frames_count_in_the_tracked_share_as_in_an_offline_run(tmp_path) -> None:
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
+        slam.source_counts.broken = 1
+        track_frames(slam, FRAMES[:4])
+        with pytest.raises(InputError, match="resize it"):
+            slam.track(FRAMES[4].timestamp_s, FRAMES[4].rgb[:-2], FRAMES[4].depth_m)
+        track_frames(slam, FRAMES[5:7])
+    shares = [row["value"] for row in slam.rows if row["name"] == "tracked_share"]
+    assert shares == [pytest.approx(6 / 8)]
+
+
 def test_frames_that_cannot_be_used_are_refused_and_the_next_is_tracked() -> None:
     first, second = FRAMES[:2]
     with LiveSlam(CAMERA, CONFIG) as slam:
