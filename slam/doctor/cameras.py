@@ -103,7 +103,7 @@ def _ask_apart(library: str) -> Asked:
     try:
         done = subprocess.run(  # nosec B603 # this module, a name of our own table
             [sys.executable, "-P", "-m", "bmask_slam.doctor.cameras", library],
-            capture_output=True, text=True, timeout=ASK_S, check=False,
+            capture_output=True, encoding="utf-8", errors="replace", timeout=ASK_S, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         return Asked(library, source, error=f"does not answer within {ASK_S:g} s")

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,18 +78,32 @@ class Torch:
 def find_machine() -> Machine:
     """This machine, now."""
     limit = memory_limit_bytes()
-    # what graph/files/disk_arrays.py writes to; here its free space is asked, nothing is written
-    scratch = os.environ.get("TMPDIR") or ("/var/tmp" if Path("/var/tmp").is_dir() else "")  # nosec B108
-    folders = dict.fromkeys([str(Path.cwd()), scratch or tempfile.gettempdir()])
     return Machine(
         describe_machine(),
         free_memory_gb(),
-        {folder: shutil.disk_usage(folder).free / 1e9 for folder in folders},
+        free_disk_gb(),
         _open_files(),
         None if limit is None else limit / 1e9,
         shutil.disk_usage(SHM).free / 1e9 if SHM.is_dir() else None,
         os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
     )
+
+
+def free_disk_gb() -> dict[str, float]:
+    """Free space by folder; a folder that is not there, since it was removed, is left out."""
+    found = {}
+    for folder in (Path.cwd, _scratch):
+        with suppress(OSError):
+            name = str(folder())
+            found[name] = shutil.disk_usage(name).free / 1e9
+    return found
+
+
+def _scratch() -> Path:
+    """What graph/files/disk_arrays.py writes to; here its free space is asked, no more."""
+    large = Path("/var/tmp")  # nosec B108
+    is_told = "TMPDIR" in os.environ or not large.is_dir()
+    return Path(tempfile.gettempdir()) if is_told else large
 
 
 def free_memory_gb() -> float | None:
@@ -109,7 +124,7 @@ def find_torch() -> Torch | None:
     try:
         done = subprocess.run(  # nosec B603 # fixed code
             [sys.executable, "-P", "-c", TORCH],
-            capture_output=True, text=True, timeout=TORCH_S, check=False,
+            capture_output=True, encoding="utf-8", errors="replace", timeout=TORCH_S, check=False,
         )  # fmt: skip
         told = json.loads(done.stdout.splitlines()[-1])
     except (subprocess.TimeoutExpired, ValueError, IndexError):

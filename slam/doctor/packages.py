@@ -50,13 +50,13 @@ import importlib, json, sys
 from bmask_slam.graph.extras import load_libusb
 load_libusb()
 for name in sys.argv[1:]:
-    print(json.dumps([name, None]), flush=True)
+    print("\\n" + json.dumps([name, None]), flush=True)
     try:
         importlib.import_module(name)
     except BaseException as error:
-        print(json.dumps([name, f"{type(error).__name__}: {error}"[:200]]), flush=True)
+        print("\\n" + json.dumps([name, f"{type(error).__name__}: {error}"[:200]]), flush=True)
     else:
-        print(json.dumps([name, ""]), flush=True)
+        print("\\n" + json.dumps([name, ""]), flush=True)
 """
 Loader = Callable[[Sequence[str]], dict[str, str]]
 
@@ -144,7 +144,8 @@ def load_apart(names: Sequence[str]) -> dict[str, str]:
         try:
             done = subprocess.run(  # nosec B603 # fixed code, names of our own table
                 [sys.executable, "-P", "-c", LOADING, *left],
-                capture_output=True, text=True, timeout=LOAD_S, check=False,
+                capture_output=True, encoding="utf-8", errors="replace",
+                timeout=LOAD_S, check=False,
             )  # fmt: skip
             output, code = done.stdout, done.returncode
         except subprocess.TimeoutExpired as late:

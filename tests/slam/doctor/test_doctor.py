@@ -167,6 +167,18 @@ def test_libraries_are_loaded_apart_and_one_that_ends_python_spares_the_others(
     }
 
 
+def test_what_a_library_writes_as_it_is_loaded_spoils_no_answer(
+    tmp_path: Path, monkeypatch
+) -> None:
+    (tmp_path / "unfinished.py").write_text("import sys; sys.stdout.write('loading ... ')")
+    (tmp_path / "pyk4a.py").write_text(
+        "import os; os.write(1, b'caf\\xe9\\n')\ndef connected_device_count(): return 1"
+    )
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    assert packages.load_apart(["unfinished", "pyk4a"]) == {"unfinished": "", "pyk4a": ""}
+    assert cameras.ask_libraries(["pyk4a"]) == (Asked("pyk4a", "azure:", ("device 0",)),)
+
+
 # --- machine -------------------------------------------------------------------------------------
 
 
@@ -203,6 +215,16 @@ def test_this_machine_is_looked_at() -> None:
     found = machine.find_machine()
     assert found.hardware["cores"].isdecimal()
     assert all(free > 0 for free in found.disk_gb.values())
+
+
+def test_folders_that_are_not_there_are_left_out(tmp_path: Path, monkeypatch) -> None:
+    (gone := tmp_path / "gone").mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    monkeypatch.setattr(machine.tempfile, "tempdir", None)  # what it has found before
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "none"))
+    free = machine.find_machine().disk_gb
+    assert len(free) == 1 and all(Path(folder).is_dir() for folder in free)
 
 
 # --- cameras -------------------------------------------------------------------------------------
