@@ -107,7 +107,10 @@ def _scratch() -> Path:
 
 
 def free_memory_gb() -> float | None:
-    """Memory that is free, or that a container's limit leaves, if that is less."""
+    """Memory that is free, or that a container's limit leaves, if that is less.
+
+    What the container has read of files counts as free: it is given up before a limit is reached.
+    """
     sizes = []
     if MEMINFO.is_file():
         match = re.search(r"MemAvailable:\s+(\d+) kB", MEMINFO.read_text(encoding="ascii"))
@@ -115,8 +118,17 @@ def free_memory_gb() -> float | None:
     files = [CGROUP / "memory.max", CGROUP / "memory.current"]
     if all(file.is_file() for file in files):
         most, used = (file.read_text(encoding="ascii").strip() for file in files)
-        sizes += [int(most) - int(used)] if most.isdecimal() and used.isdecimal() else []
+        if most.isdecimal() and used.isdecimal():
+            sizes.append(int(most) - int(used) + _read_of_files())
     return min(sizes) / 1e9 if sizes else None
+
+
+def _read_of_files() -> int:
+    """Bytes of files that a container keeps in memory and has not used lately."""
+    file = CGROUP / "memory.stat"
+    text = file.read_text(encoding="ascii") if file.is_file() else ""
+    match = re.search(r"^inactive_file (\d+)$", text, re.MULTILINE)
+    return int(match[1]) if match else 0
 
 
 def find_torch() -> Torch | None:

@@ -195,6 +195,15 @@ def test_a_containers_limit_counts(tmp_path: Path, monkeypatch) -> None:
     assert machine.free_memory_gb() == pytest.approx(8.192)
 
 
+def test_files_that_a_container_has_read_are_not_used_memory(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(machine, "MEMINFO", tmp_path / "meminfo")
+    monkeypatch.setattr(machine, "CGROUP", tmp_path)
+    (tmp_path / "memory.max").write_text("8000000000\n")
+    (tmp_path / "memory.current").write_text("7500000000\n")
+    (tmp_path / "memory.stat").write_text("anon 1000000000\ninactive_file 6000000000\n")
+    assert machine.free_memory_gb() == pytest.approx(6.5)
+
+
 def test_too_little_of_something_is_a_problem() -> None:
     poor = replace(MACHINE, memory_gb=0.5, disk_gb={"/var/tmp": 0.2}, open_files=256)
     assert [text.split(";")[0] for text in poor.problems()] == [
