@@ -13,6 +13,7 @@ from bmask_slam.features.keypoint_depth import mean_on_plane, smooth_value
 from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
 from bmask_slam.graph.calibration.model import CalibrationViews
 from bmask_slam.graph.camera import NO_DEPTH_DISTORTION, Camera
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.factors.observability import component_labels
@@ -214,9 +215,8 @@ class SequenceDepths:
         """As `DepthReader.measure`."""
         sequence, index = self.sequence, self._frames[keyframe_id]
         image = _raw_inverse_depth(sequence, index)
-        change, step_s = _change_around(sequence, index)
         lag_s = sequence.pairs.lags_s[index] - sequence.camera.depth_time_offset_s
-        return measured_at(pixels, image, change / step_s, lag_s, sigmas)
+        return measured_at(pixels, image, _rate_around(sequence, index), lag_s, sigmas)
 
 
 def measured_at(pixels: Array, image: Array, rate: Array, lag_s: float, sigmas: Array) -> Depths:
@@ -235,16 +235,22 @@ def _raw_inverse_depth(sequence: Sequence, index: int) -> Array:
     return 1.0 / sequence.recording.read_depth(file, camera).astype(float)
 
 
-def _change_around(sequence: Sequence, index: int) -> tuple[Array, float]:
-    """Change (H, W) of inverse depth from the previous to the next depth image, and the seconds.
+def _rate_around(sequence: Sequence, index: int) -> Array:
+    """Change (H, W) of inverse depth in a second, by the previous and the next depth image.
 
-    NaN where the surface changed, and everywhere if an image is missing or too far in time.
+    NaN where the surface changed, and everywhere if an image is missing, broken or too far in time.
     """
-    before, after = max(index - 1, 0), min(index + 1, len(sequence) - 1)
-    depth_stamps_s = sequence.pairs.timestamps_s + sequence.pairs.lags_s
-    step_s = float(depth_stamps_s[after] - depth_stamps_s[before])
-    first, last = (_raw_inverse_depth(sequence, i) for i in (before, after))
-    return inverse_depth_change(first, last, step_s if after - before >= 2 else 0.0), step_s
+    unknown = np.full((sequence.camera.height, sequence.camera.width), np.nan)
+    if not 0 < index < len(sequence) - 1:
+        return unknown
+    around = [index - 1, index + 1]
+    try:
+        first, last = (_raw_inverse_depth(sequence, i) for i in around)
+    except InputError:
+        return unknown
+    stamps_s = (sequence.pairs.timestamps_s + sequence.pairs.lags_s)[around]
+    step_s = float(stamps_s[1] - stamps_s[0])
+    return inverse_depth_change(first, last, step_s) / step_s
 
 
 def inverse_depth_change(first: Real, last: Real, step_s: float) -> Real:

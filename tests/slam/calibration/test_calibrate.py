@@ -103,6 +103,17 @@ def test_a_known_distance_gives_the_scale(made: tuple[Path, Path], tmp_path: Pat
     assert done.camera.depth_scale == pytest.approx(TRUTH.depth_scale, rel=0.005)
 
 
+def test_a_broken_depth_image_beside_a_keyframe_only_lacks_its_rate(
+    made: tuple[Path, Path], tmp_path: Path
+) -> None:
+    sequence, run = made
+    shutil.copytree(sequence, beside := tmp_path / "sequence")
+    file = sorted((beside / "depth").iterdir())[3]  # three for each keyframe, the second is its own
+    file.write_bytes(file.read_bytes()[:200])
+    options = CalibrateOptions(run, tmp_path / "c.yaml", beside)
+    assert calibrate_run(options).camera.depth_time_offset_s == pytest.approx(DELAY_S, abs=0.001)
+
+
 def test_the_next_run_reads_what_was_written(made: tuple[Path, Path], tmp_path: Path) -> None:
     """Scale, offset and time: depth images are those at the stamps of the colour images."""
     sequence, _ = made
