@@ -40,11 +40,16 @@ class MarkerDetector:
     def detect(self, frame: Frame, camera: Camera) -> Measurements:
         """The markers in a frame, as rows of "markers" by rising ids; pure.
 
-        Of an id that is there twice none is used, since one of them is another marker.
+        Of an id that is there twice none is used, since one of them is another marker. Nor is one
+        in what the camera says is covered, since it is attached to the camera.
         """
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         found, numbers, _ = self._detector.detectMarkers(gray)
         ids = np.zeros(0, int) if numbers is None else np.ravel(numbers)
+        if camera.covered and len(ids):
+            columns, lines = np.rint(np.reshape(found, (-1, 2))).astype(int).T
+            free = camera.visible()[lines, columns].reshape(-1, 4).all(axis=1)
+            found, ids = [f for f, is_free in zip(found, free, strict=True) if is_free], ids[free]
         rows = []
         for number in sorted(set(ids.tolist())):
             which = np.flatnonzero(ids == number)

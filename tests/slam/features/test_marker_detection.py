@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -86,6 +88,18 @@ def test_the_two_poses_of_a_small_square_are_both_given() -> None:
     depth = SeenCorners(places, 1e-3, 1 / points[:, 2], np.full(4, 1e-4))
     for found in possible_poses(depth, np.log(0.2), 1e-3):
         assert np.abs(se3_log(found.T_marker_camera @ T)).max() < 1e-3
+
+
+def test_a_marker_on_what_is_covered_is_not_in_the_room() -> None:
+    """One of a robot's own, beside another of the same number on the wall."""
+    other = FACING @ make_pose(np.eye(3), np.array([-0.45, 0.0, 0.0]))
+    frame = frame_of(image_of(T_CAMERA_MARKER, 3, image_of(other, 3)), T_CAMERA_MARKER)
+    where = CAMERA.project(other[None, :3, 3])[0]
+    left = replace(CAMERA, covered=((0, 0, int(where[0]) + 20, CAMERA.height),))
+    (row,) = MarkerDetector(CONFIG, FeatureConfig()).detect(frame, left).rows
+    there = CAMERA.project(T_CAMERA_MARKER[None, :3, 3])[0]
+    u, v = SeenCorners.of(row[2:]).places.mean(axis=0) * [CAMERA.fx, CAMERA.fy]
+    assert np.abs([u + CAMERA.cx, v + CAMERA.cy] - there).max() < 3
 
 
 def test_an_id_that_is_there_twice_and_small_markers_are_not_used() -> None:
