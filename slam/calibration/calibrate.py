@@ -139,7 +139,7 @@ def check_options(options: CalibrateOptions) -> Path:
             raise InputError(f"--fix {name}: is no parameter; they are {', '.join(PARAMETERS)}")
     if options.on_body and options.reference is None:
         raise InputError("--hand-eye: finds where the reference sits; give it as --reference")
-    if not options.anchor_sigma_m > 0:
+    if not 0 < options.anchor_sigma_m < np.inf:
         raise InputError(f"--anchor-sigma {options.anchor_sigma_m}: must be positive metres")
     return out
 
@@ -227,8 +227,9 @@ def _with_distance(
     *moments_s, distance_m = known
     trajectory = run.trajectories["trajectory.txt"]
     at = nearest_indices(trajectory.timestamps_s, np.array(moments_s))
-    late_s = np.abs(trajectory.timestamps_s[at] - moments_s)
-    if not distance_m > 0 or late_s.max() > MAX_TIME_DIFFERENCE_S or at[0] == at[1]:
+    late_s = np.abs(trajectory.timestamps_s[at] - moments_s).max()  # may be NaN
+    near = late_s <= MAX_TIME_DIFFERENCE_S and at[0] != at[1]
+    if not (near and 0 < distance_m < np.inf):
         raise InputError(
             f"--known-distance {' '.join(f'{x:.16g}' for x in known)}: give two different stamps "
             f"of {run.path / 'trajectory.txt'}, to {MAX_TIME_DIFFERENCE_S:g} s, and a positive "

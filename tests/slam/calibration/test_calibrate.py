@@ -172,7 +172,10 @@ def test_what_is_smooth_is_judged_by_the_noise_of_the_image() -> None:
     [
         ({"fixed": ("focal",)}, "--fix focal: is no parameter"),
         ({"anchor_sigma_m": 0.0}, "--anchor-sigma 0.0: must be positive"),
+        ({"anchor_sigma_m": np.inf}, "--anchor-sigma inf: must be positive"),
         ({"known_distance": (0.1, 99.0, 1.0)}, "--known-distance 0.1 99 1: give two different"),
+        ({"known_distance": (np.nan, 0.3, 1.0)}, "--known-distance nan 0.3 1: give two different"),
+        ({"known_distance": (0.1, 0.3, np.inf)}, "--known-distance 0.1 0.3 inf: give two"),
         ({"sequence": Path("/nowhere")}, "/nowhere: no such folder"),
         ({"run": Path("/nowhere")}, "/nowhere: no such folder; give the folder of a run"),
     ],
