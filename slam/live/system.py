@@ -104,8 +104,6 @@ class LiveSystem(SlamSystem):
         if seen is not None:
             self._found_covered(*seen)
         result = super().process(frame, features if seen is None else None)
-        if found is not None:
-            found.add_frame(frame, self._keyframe(result))
         return self._filter.filtered(result) if self.config.smooth_trajectory else result
 
     def _found_covered(self, camera: Camera, text: str) -> None:
@@ -117,11 +115,6 @@ class LiveSystem(SlamSystem):
             self.leave_out(camera)
             if self.remote.extends:  # the map so far may be bent by it
                 self.begin_anew()
-
-    def _keyframe(self, result: FrameResult) -> Keyframe | None:
-        """The keyframe that a frame has become, if it has."""
-        made = result.keyframe_id
-        return None if made is None else self.remote.world.keyframes.get(made)
 
     def _map_uses_camera(self, camera: Camera, motions: Mapping[int, KeyframeMotion]) -> None:
         """Tell the map; tracking uses the camera from the next frame on."""
@@ -234,8 +227,13 @@ class LiveSystem(SlamSystem):
     def _record_pose(
         self, frame: Frame, tracked: Tracked, keyframe: Keyframe | None
     ) -> Array | None:
-        """As offline; where no keyframes are made, the local map follows the landmarks in view."""
+        """As offline, and calibration gets the frame, as it is tracked.
+
+        Where no keyframes are made, the local map follows the landmarks in view.
+        """
         T_world_camera = super()._record_pose(frame, tracked, keyframe)
+        if self.calibration is not None:
+            self.calibration.add_frame(frame, keyframe)
         reference = self.camera_tracker.reference
         if self.dense and reference and tracked.status.by_image and T_world_camera is not None:
             self.dense.frames.offer(frame, T_world_camera, reference, keyframe)

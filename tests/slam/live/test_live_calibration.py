@@ -19,7 +19,7 @@ from faults import LONG_S
 from feeding import track_frames
 from recorded_bags import DEPTH, INFO, RGB, BagMaker, image
 from shifted_stamps import with_depth_stamps
-from synthetic_view import CAMERA
+from synthetic_view import CAMERA, PlaneViews, sideways_path
 
 from bmask_slam.calibration.config import FREE, SelfCalibrationConfig
 from bmask_slam.calibration.keyframe_depth import DepthImage, KeyframeImages
@@ -244,6 +244,20 @@ def test_a_recording_does_not_wait_for_a_calibration_that_hangs(monkeypatch, cap
             slam.catch_up(waiting=0)
             assert time.monotonic() - begin_s < LONG_S / 2
         assert caplog.text.count("has not answered for 1 s; tracking goes on") == 1
+
+
+def test_calibration_gets_depth_as_it_is_tracked(monkeypatch) -> None:
+    """A program may write 0 where depth is missing; edges of depth would be around each hole."""
+    views, sent = PlaneViews(sideways_path(0.02 * np.arange(4))), []
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(calibrate="report")) as slam:
+        monkeypatch.setattr(slam._system.calibration._worker, "send", sent.append)
+        slam._system.keyframes.decide = lambda tracked: "test"
+        for frame in views:
+            frame.depth_m[:50] = 0.0
+            slam.track(frame.timestamp_s, frame.rgb, frame.depth_m)
+    assert len(sent) == 2
+    for image in (sent[0].before, sent[0].depth, sent[0].after):
+        assert np.isnan(image.depth_m[:50]).all() and (image.depth_m[50:] > 0).all()
 
 
 def test_an_unknown_choice_is_refused() -> None:
