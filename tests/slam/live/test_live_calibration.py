@@ -256,8 +256,8 @@ def test_calibration_gets_depth_as_it_is_tracked(monkeypatch) -> None:
             frame.depth_m[:50] = 0.0
             slam.track(frame.timestamp_s, frame.rgb, frame.depth_m)
     assert len(sent) == 2
-    for image in (sent[0].before, sent[0].depth, sent[0].after):
-        assert np.isnan(image.depth_m[:50]).all() and (image.depth_m[50:] > 0).all()
+    for depth in (sent[0].before, sent[0].depth, sent[0].after):
+        assert np.isnan(depth.depth_m[:50]).all() and (depth.depth_m[50:] > 0).all()
 
 
 def test_an_unknown_choice_is_refused() -> None:
