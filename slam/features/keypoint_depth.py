@@ -65,14 +65,14 @@ def sample_depth(depth_m: Floats, pixels: Array, config: DepthSampling) -> tuple
 def _depth_windows(depth_m: Floats, pixels: Array, radius: int) -> tuple[Array, Array, Array]:
     """Median, half the interquartile range and range (N,) of the windows around pixels, in metres.
 
-    NaN where no more than half of a window is valid.
+    NaN where no more than half of a window is valid; missing depth is NaN or 0.
     """
     height, width = depth_m.shape
     offsets = np.arange(-radius, radius + 1)
     rows = np.clip(np.rint(pixels[:, 1]).astype(int)[:, None] + offsets, 0, height - 1)
     columns = np.clip(np.rint(pixels[:, 0]).astype(int)[:, None] + offsets, 0, width - 1)
     window = depth_m[rows[:, :, None], columns[:, None, :]].reshape(len(pixels), offsets.size**2)
-    window = np.sort(window.astype(float), axis=1)  # NaN sorts last
+    window = np.sort(np.where(window > 0, window, np.nan).astype(float), axis=1)  # NaN sorts last
     count = np.isfinite(window).sum(axis=1)
     window[count * 2 <= offsets.size**2] = np.nan
     index = np.arange(len(pixels))

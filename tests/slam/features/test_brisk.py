@@ -321,6 +321,14 @@ def test_depth_needs_half_of_the_window() -> None:
         assert np.isfinite(depth_at(depth, 200, 100)[0]) == good, missing
 
 
+def test_missing_depth_may_be_0_as_of_features_that_are_made_ahead() -> None:
+    depth, pixels = np.full((20, 20), np.nan, np.float32), np.array([[10.0, 10.0], [7.0, 7.0]])
+    depth[8:12, 8:13] = 2.0
+    nan, zero = (sample_depth(image, pixels, CONFIG) for image in (depth, np.nan_to_num(depth)))
+    np.testing.assert_array_equal(zero, nan)
+    assert np.isfinite(nan[0]).tolist() == [True, False]
+
+
 def test_depth_is_the_median_and_the_spread_of_the_valid() -> None:
     depth = 1.0 + 0.01 * RNG.random((480, 640))
     depth[100, 201] = np.nan
