@@ -38,7 +38,7 @@ WAITING = 1
 Tracking against a map that is far behind is lost.
 """
 
-_Pairs: TypeAlias = Iterator[tuple[Frame, Prepared]]
+_Pairs: TypeAlias = Iterator[tuple[Frame, Prepared | None]]
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def play(
             frame, prepared = pair
             if not options.realtime:  # its latency counts from now: it waited in the queue
                 slam.catch_up(WAITING)
-                prepared = replace(prepared, arrived_s=time.monotonic())
+                prepared = prepared and replace(prepared, arrived_s=time.monotonic())
             try:
                 result = _track(slam, source, frame, prepared)
                 if listener is not None:
@@ -109,7 +109,7 @@ def play(
     return stop.signal
 
 
-def _track(slam: LiveSlam, source: Source, frame: Frame, prepared: Prepared) -> FrameResult:
+def _track(slam: LiveSlam, source: Source, frame: Frame, prepared: Prepared | None) -> FrameResult:
     """Track a frame; the source goes on with the camera that may have been found meanwhile."""
     camera = slam.camera
     result = slam.track(
@@ -122,14 +122,22 @@ def _track(slam: LiveSlam, source: Source, frame: Frame, prepared: Prepared) -> 
 
 
 def _with_features(slam: LiveSlam, source: Source) -> _Pairs:
-    """Frames with their features, which another thread iterates over ahead of tracking."""
+    """Frames with their features, which another thread iterates over ahead of tracking.
+
+    None for a frame that is refused: ``track`` refuses it, and the next one is used.
+    """
     for frame in source.frames():
-        yield frame, slam.prepare(frame.rgb, frame.depth_m)
+        try:
+            prepared = slam.prepare(frame.rgb, frame.depth_m)
+        except InputError:
+            yield frame, None
+        else:
+            yield frame, prepared
 
 
 def _newest(
     slam: LiveSlam, pairs: _Pairs, options: PlayOptions, stop: StopRequest
-) -> Iterator[tuple[Frame, Prepared] | None]:
+) -> Iterator[tuple[Frame, Prepared | None] | None]:
     """Frames as they come, without those that tracking has no time for; None where none comes."""
     newest = Newest(pairs, KEPT)
     heard_s, silent = time.monotonic(), False

@@ -143,6 +143,24 @@ def test_a_waiting_source_is_tracked_completely_without_refused_frames(slam) -> 
     assert (health.frames, health.frames_refused, health.frames_dropped) == (5, 2, 0)
 
 
+@pytest.mark.parametrize("realtime", [False, True])
+def test_a_broken_large_frame_is_skipped(realtime: bool) -> None:
+    """Its images are reduced ahead of tracking."""
+    source = FakeSource([_twice_as_large(frame) for frame in FRAMES[:5]])
+    source.camera = CAMERA.of_size(2 * CAMERA.width, 2 * CAMERA.height)
+    source._frames[2] = replace(source._frames[2], depth_m=-source._frames[2].depth_m)
+    with LiveSlam(source.camera) as slam:
+        assert slam.camera.reduced_by == 2
+        assert play(slam, source, PlayOptions(realtime=realtime, quiet=True)) is None
+        health = slam.health()
+    assert health.frames_refused == 1 and health.frames + health.frames_dropped == 4
+
+
+def _twice_as_large(frame: Frame) -> Frame:
+    rgb, depth_m = (a.repeat(2, axis=0).repeat(2, axis=1) for a in (frame.rgb, frame.depth_m))
+    return replace(frame, rgb=rgb, depth_m=depth_m)
+
+
 def test_a_waiting_source_does_not_outrun_the_map(monkeypatch) -> None:
     settings = ["keyframes.min_interval_frames=1", "keyframes.max_shared=1.1"]
     to_and_fro = [*POSES, *POSES[::-1]] * 2  # keyframes are made when the map has time for them
