@@ -43,7 +43,7 @@ def add_calibrate(commands: Commands) -> None:
         type=int,
         default=1,
         metavar="N",
-        help="calibrate up to N times, until nothing changes by more than its sigma (default: 1)",
+        help="calibrate up to N times, until all changes are within 95 %% bounds (default: 1)",
     )
     add_output_arguments(parser, "the file's path")
 

@@ -61,6 +61,8 @@ class FeatureConfig:
             )
         if not self.thresholds or self.bucket_px < 1:
             raise ValueError("thresholds must not be empty, bucket_px at least 1")
+        if any(s is not None and s <= 0 for s in (self.pixel_sigma, self.disparity_sigma_px)):
+            raise ValueError("pixel_sigma and disparity_sigma_px must be more than 0")
 
 
 @dataclass(frozen=True)

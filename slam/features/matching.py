@@ -31,6 +31,10 @@ class MatchConfig:
     max_angle_rad: float | None = None
     max_scale_ratio: float = 2.0
 
+    def __post_init__(self) -> None:
+        if self.max_scale_ratio <= 1:
+            raise ValueError("max_scale_ratio must be more than 1")
+
 
 @dataclass(frozen=True)
 class Matches:

@@ -39,6 +39,8 @@ class PoseOptimisationConfig:
             raise ValueError("kernel_iterations and final_iterations must be at least 1")
         if not self.kernel_widths and not self.final_rounds:
             raise ValueError("there must be kernel_widths or final_rounds")
+        if self.max_noise_scale < 1:
+            raise ValueError("max_noise_scale must be at least 1")
 
 
 @dataclass(frozen=True)
