@@ -59,8 +59,7 @@ def finish_run(run: ActiveRun) -> RunSummary:
     run.system.finish()
     give_back_memory()  # ISAM2's, which is not needed any more
     run.folder.write_events(run.system.events.take())
-    arrived = len(range(0, counters.next_index, options.stride))
-    rows = measure(run.system, run.reference, counters, arrived)
+    rows = measure(run.system, run.reference, counters, _arrived(run))
     checked = _camera_checked(run)
     rows += checked.rows
     if stopped_by is not None:
@@ -108,6 +107,11 @@ def _look_back(run: ActiveRun) -> None:
         run.sequence = run.sequence.with_camera(run.calibrator.state.camera)
         write_found_camera(run)
         remove(run.folder.path / DENSE)
+
+
+def _arrived(run: ActiveRun) -> int:
+    """Frames of the sequence so far, with the broken ones."""
+    return len(range(0, run.counters.next_index, run.options.stride))
 
 
 def _unwritten_checkpoints(run: ActiveRun) -> tuple[str, ...]:
