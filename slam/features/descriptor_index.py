@@ -19,6 +19,8 @@ _Found = tuple[Ints, Ints, Ints]
 """What faiss found: where each query's rows begin and end, their distances, the rows."""
 BITS = 512
 ROWS_PER_LIST = 32  # before the index is partitioned
+NOBODY = -1
+"""Owner of a removed keyframe's rows; one that is added under its id again has rows of its own."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,7 @@ class DescriptorIndex:
         if descriptors is None:
             return
         self._removed += len(descriptors)
+        self._owners = [NOBODY if k == keyframe_id else k for k in self._owners]
         if 2 * self._removed > self._rows:
             self.rebuild()
 
@@ -121,7 +124,7 @@ class DescriptorIndex:
         """Votes of descriptors (N, 8) for the keyframes in the index, without the excluded ones."""
         excluded = set(excluded)
         candidates = [k for k in self._descriptors if k not in excluded]
-        allowed = np.zeros(max(candidates, default=-1) + 2, bool)  # its last entry stays False
+        allowed = np.zeros(max(candidates, default=-1) + 2, bool)  # the last, NOBODY's, stays False
         allowed[candidates] = True
         query, keyframe_ids, distance = self._near(descriptors)
         keep = allowed[np.minimum(keyframe_ids, len(allowed) - 1)]
@@ -141,7 +144,7 @@ class DescriptorIndex:
         return Votes(ids[order].astype(np.int64), scores[order])
 
     def _near(self, descriptors: Bits) -> tuple[Ints, Ints, Ints]:
-        """(query row, keyframe id, Hamming distance) within the gate, also of removed keyframes."""
+        """(query row, keyframe id or NOBODY, Hamming distance) within the gate."""
         query = self._query(descriptors)
         if self._rows == 0 or len(query) == 0:
             return (np.zeros(0, np.int64),) * 3

@@ -131,6 +131,17 @@ def test_removing_equals_never_adding(config: IndexConfig, rng: np.random.Genera
     assert 0 in pruned.votes(keyframes[0]).keyframe_ids
 
 
+def test_a_keyframe_that_is_added_again_has_its_new_descriptors(rng: np.random.Generator) -> None:
+    first, second, other = (random_descriptors(40, rng) for _ in range(3))
+    index = DescriptorIndex(WHOLE)
+    for k, descriptors in enumerate((other, first, random_descriptors(90, rng))):
+        index.add(k, descriptors)
+    index.remove(1)
+    index.add(1, second)
+    assert len(index.votes(first)) == 0
+    assert index.votes(second).keyframe_ids.tolist() == [1]
+
+
 def test_excluded_keyframes_do_not_displace_others(rng: np.random.Generator) -> None:
     """The best of the others is compared with the others only, not with excluded ones."""
     place = random_descriptors(40, rng)
