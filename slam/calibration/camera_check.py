@@ -1,7 +1,7 @@
 """Whether a run contradicts its camera: focal lengths, registration of depth, stamps.
 
 Nothing here uses a reference. What right cameras show has been measured: published focal lengths
-are up to 1.8 +- 0.6 % from what the motion shows, and edges of registered depth within 2 px of
+are up to 1.8 +- 0.6 % from what the motion shows, and edges of registered depth within 3 px of
 those of colour. The limits lie above that (docs/data.md). The scale of depth has no statistic:
 images and depth fit a world of any size equally well.
 """
