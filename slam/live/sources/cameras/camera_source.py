@@ -98,6 +98,8 @@ class CameraSource(MeasuredSource, ABC):
             doubted = (stamp_s, images) if clock.doubts(RGB) else None
             if doubted is None:
                 yield stamp_s, images
+        if doubted is not None:  # of a recording, which ends with it
+            yield doubted
 
     def close(self) -> None:
         """End ``frames`` soon, or release the device if they have not begun; from any thread."""

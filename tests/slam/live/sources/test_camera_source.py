@@ -177,6 +177,14 @@ def test_one_wrong_stamp_leaves_the_time_of_later_frames(monkeypatch, wrong_s: f
     assert found_s == pytest.approx([*stamps_s[:10], *stamps_s[11:]])
 
 
+def test_the_last_image_of_a_recording_comes_also_after_a_pause(monkeypatch) -> None:
+    plug_in(monkeypatch, Device([frameset(k, 1000 * s) for k, s in enumerate((1.0, 1.03, 5.0))]))
+    source = RealSenseSource(silence_s=SILENCE_S)
+    capture = source._capture_images
+    monkeypatch.setattr(source, "_capture_images", lambda: capture() or source.close())
+    assert [frame.timestamp_s for frame in source.frames()] == [1.0, 1.03, 5.0]
+
+
 def test_a_missing_realsense_is_refused(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(InputError, match=r"needs pyrealsense2.*bmask-slam\[realsense\]"):
