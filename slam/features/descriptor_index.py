@@ -106,7 +106,7 @@ class DescriptorIndex:
         if descriptors is None:
             return
         self._removed += len(descriptors)
-        self._owners = [NOBODY if k == keyframe_id else k for k in self._owners]
+        self._owners[:] = [NOBODY if k == keyframe_id else k for k in self._owners]
         if 2 * self._removed > self._rows:
             self.rebuild()
 
