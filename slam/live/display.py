@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import asdict
 from typing import TYPE_CHECKING
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Image
+from bmask_slam.graph.errors import InputError
 from bmask_slam.labelling.results import MapObjects
 from bmask_slam.live.health import Health
 from bmask_slam.live.messages import Masks
@@ -21,6 +23,8 @@ from bmask_slam.world.world_map import WorldMap
 
 if TYPE_CHECKING:  # it loads torch
     from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
+
+logger = logging.getLogger(__name__)
 
 IMAGE_EVERY = 3
 """Interval in frames of images that are shown."""
@@ -37,7 +41,7 @@ MOVED_M, TURNED = 0.002, 0.001
 
 
 class Display:
-    """Updates a scene, which its maker closes."""
+    """Updates a scene."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -48,6 +52,13 @@ class Display:
         self._unsegmented: dict[int, bytes] = {}
         self._asked_s = 0.0
         self._objects: MapObjects | None = None
+
+    def close(self) -> None:
+        """End what is shown; a recording that cannot be written to its end is warned about."""
+        try:
+            self._scene.close()
+        except InputError as error:
+            logger.warning("%s", error)
 
     def follow(self, system: LiveSystem) -> None:
         """Show the masks of a system's keyframes as they arrive."""

@@ -127,10 +127,11 @@ class LiveSlam(LiveMap):
         if not self.options.view.enabled:
             return None
         scene = Scene(self.options.title, self.options.view)
-        stack.callback(scene.close)
+        display = Display(scene)
+        stack.callback(display.close)
         self.viewer_url, self.viewer_addresses = scene.url, scene.addresses
         scene.log_camera(self.camera)
-        return Display(scene)
+        return display
 
     def prepare(self, rgb: Image, depth_m: Floats) -> Prepared:
         """Extract a frame's features for ``track``; may be called ahead, in another thread.

@@ -16,7 +16,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Bytes
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import import_extra
-from bmask_slam.viewer.options import LOCAL, ViewOptions
+from bmask_slam.viewer.options import LOCAL, ViewOptions, writing
 from bmask_slam.viewer.shown import Box, Ellipsoid, Points, SegmentedImage, quaternion
 
 if TYPE_CHECKING:  # it loads torch
@@ -39,7 +39,8 @@ class FoxgloveTransport:
         """Open the file, or the websocket.
 
         Raises:
-            InputError: foxglove-sdk is not installed, or the port is taken.
+            InputError: foxglove-sdk is not installed, the port is taken, or the file cannot be
+                written.
         """
         self._fg: Any = import_extra("foxglove", "--foxglove", "foxglove")
         self._m: Any = import_extra("foxglove.messages", "--foxglove", "foxglove")
@@ -48,10 +49,12 @@ class FoxgloveTransport:
         self._ns = 0
         self._context = self._fg.Context()
         self.address = ""
-        if options.foxglove_file is not None:
-            self._sink = self._fg.open_mcap(
-                options.foxglove_file, allow_overwrite=True, context=self._context
-            )
+        self._file = options.foxglove_file
+        if self._file is not None:
+            with writing(self._file):
+                self._sink = self._fg.open_mcap(
+                    self._file, allow_overwrite=True, context=self._context
+                )
         else:
             self._sink = self._served(name, options.host, options.foxglove_port)
 
@@ -241,10 +244,11 @@ class FoxgloveTransport:
 
     def close(self) -> None:
         """See `Transport`."""
-        if hasattr(self._sink, "stop"):
+        if self._file is None:
             self._sink.stop()
         else:
-            self._sink.close()
+            with writing(self._file):
+                self._sink.close()
 
     def _entity(self, path: str, **primitives: Any) -> None:
         entity = self._m.SceneEntity(

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+
+from bmask_slam.graph.errors import InputError
 
 LOCAL = "127.0.0.1"
 
@@ -42,3 +46,17 @@ class ViewOptions:
     def enabled(self) -> bool:
         """Whether it is shown at all."""
         return self.in_rerun or self.in_foxglove
+
+
+@contextmanager
+def writing(file: Path) -> Iterator[None]:
+    """What a viewer's library raises while it opens or ends a file is an InputError with its name.
+
+    A library says neither the file nor, as ``OSError.errno``, the reason.
+    """
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        reason = str(error).partition(", path")[0]
+        cure = "change the folder's permissions, free some space, or choose another place"
+        raise InputError(f"{file}: {reason}; {cure}") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,7 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import import_extra
 from bmask_slam.semantics.instances.overlay import class_colour
-from bmask_slam.viewer.options import ViewOptions
+from bmask_slam.viewer.options import ViewOptions, writing
 from bmask_slam.viewer.shown import Box, Ellipsoid, Points, SegmentedImage, quaternion
 from bmask_slam.viewer.web_viewer import WebViewer
 
@@ -24,6 +25,9 @@ logger = logging.getLogger(__name__)
 TIMELINE = "time"
 FLUSH_S = 10.0
 """The longest wait for a viewer at the end."""
+FILE_FLUSH_S = 60.0
+"""The longest wait for a file. After an error in writing, Rerun's flush, disconnect and destructor
+may wait for ever, for a thread that has ended."""
 MAX_NAMES = 40
 """With more objects names show where the mouse is; in a view so full none could be read."""
 
@@ -39,15 +43,12 @@ class RerunTransport:
                 the recording cannot be written.
         """
         self._rr: Any = import_extra("rerun", "the viewer", "view")
+        self._file = options.record
         self._viewer: WebViewer | None = None
         self._stream = self._rr.RecordingStream(f"bmask-slam {name}")
         if options.record is not None:
-            try:
+            with writing(options.record):
                 self._stream.save(str(options.record))
-            except RuntimeError as error:
-                reason = str(error).partition(", path")[0]
-                cure = "change the folder's permissions, or choose another place"
-                raise InputError(f"{options.record}: {reason}; {cure}") from error
         elif options.serve:
             import rerun_cli  # noqa: PLC0415 - a part of Rerun
 
@@ -195,12 +196,27 @@ class RerunTransport:
 
         A viewer that does not take the data within FLUSH_S loses the rest of it, and one that is
         served ends with it.
+
+        Raises:
+            InputError: the recording cannot be written to its end.
         """
         if self._viewer is not None:  # first: the stream would wait for one that takes nothing
             self._viewer.close()
+        elif self._file is not None:
+            with writing(self._file):
+                self._end_file()
         else:
             self._flush()
         self._stream.disconnect()
+
+    def _end_file(self) -> None:
+        """Write buffered data; a stream that fails is left as it is, to the end of the process."""
+        try:
+            self._stream.flush(timeout_sec=FILE_FLUSH_S)
+        except RuntimeError:
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._stream))
+            self._rr.unregister_shutdown()
+            raise
 
     def _flush(self) -> None:
         try:

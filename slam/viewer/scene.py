@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,8 +49,8 @@ class Scene:
         """Show it as asked for.
 
         Raises:
-            InputError: the viewer's library is not installed, the file's folder is not there, or
-                the port is taken.
+            InputError: the viewer's library is not installed, a file cannot be written, or the
+                port is taken.
         """
         for file in filter(None, (options.record, options.foxglove_file)):
             _check_folder(file)
@@ -206,9 +207,14 @@ class Scene:
             each.set_time(timestamp_s)
 
     def close(self) -> None:
-        """Write or send what is left, and end."""
-        for each in self._transports:
-            each.close()
+        """Write or send what is left, and end.
+
+        Raises:
+            InputError: a file cannot be written to its end.
+        """
+        with ExitStack() as stack:  # each is closed, also after one that fails
+            for each in self._transports:
+                stack.callback(each.close)
 
 
 def _check_folder(file: Path) -> None:

@@ -151,7 +151,11 @@ class Transport(Protocol):
         """Remove what is at a path, and below it."""
 
     def close(self) -> None:
-        """Send or write what is left, and end."""
+        """Send or write what is left, and end.
+
+        Raises:
+            InputError: a file cannot be written to its end.
+        """
 
 
 def as_jpeg(rgb: Image) -> bytes:
