@@ -21,9 +21,10 @@ SIGNALS = [
 class StopRequest:
     """In its block the first of these signals only sets ``signal``; a second one acts as usual.
 
-    Outside the main thread, where Python allows no handlers, ``signal`` is never set. A SIGHUP that
-    the caller ignores, as under nohup, stays ignored; a handler that is not Python's, of a program
-    that embeds it, stays in place, since it could not be put back.
+    Outside the main thread, where Python allows no handlers, ``signal`` is never set. A signal that
+    the caller ignores, as SIGHUP under nohup and SIGINT in a background job of a script, stays
+    ignored; a handler that is not Python's, of a program that embeds it, stays in place, since it
+    could not be put back.
     """
 
     def __init__(self) -> None:
@@ -34,8 +35,7 @@ class StopRequest:
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
                 present = signal.getsignal(number)  # None: not Python's
-                is_nohup = number.name == "SIGHUP" and present is signal.SIG_IGN
-                if present is not None and not is_nohup:
+                if present not in (None, signal.SIG_IGN):
                     self._previous[number] = signal.signal(number, self._note)
         return self
 

@@ -32,3 +32,15 @@ def test_a_handler_that_is_not_pythons_stays(monkeypatch: pytest.MonkeyPatch) ->
     with StopRequest() as stop:
         assert stop.signal is None
     assert not taken
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_that_the_caller_ignores_stays_ignored(number: signal.Signals) -> None:
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        with StopRequest() as stop:
+            signal.raise_signal(number)
+            assert stop.signal is None
+        assert signal.getsignal(number) is signal.SIG_IGN
+    finally:
+        signal.signal(number, before)
