@@ -18,6 +18,7 @@ from bmask_slam.commands.arguments import (
     add_segmenter_arguments,
     add_topic_arguments,
     add_view_arguments,
+    asks_for_map,
     bag_topics,
     chosen_config,
     format_summary,
@@ -73,7 +74,7 @@ def add_live(commands: Commands) -> None:
     parser.add_argument("--map", action="store_true", help="also a dense map, as by bmask-slam map")
     add_mesh_voxel_argument(parser)
     text = "with --map: at most N frames a second between keyframes go into it (default: 5)"
-    parser.add_argument("--map-frames", type=float, metavar="N", default=5.0, help=text)
+    parser.add_argument("--map-frames", type=float, metavar="N", help=text)
     add_segmenter_arguments(parser, "light")
     parser.add_argument("--view", action="store_true", help="show it in Rerun's window")
     add_view_arguments(parser)
@@ -264,7 +265,7 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
         view=view_options(arguments, arguments.view),
         images=recording,
         title=source.name,
-        dense=arguments.map,
+        dense=asks_for_map(arguments, arguments.map),
         mesh_voxel_m=arguments.mesh_voxel_m,
         surface_frames=frames_a_second(arguments.map_frames) if arguments.map else None,
         submap_points=POINTS if ros2_of(source) is not None else 0,

@@ -127,10 +127,12 @@ def start_calibration(
     )
 
 
-def frames_a_second(most: float) -> FrameOptions:
+def frames_a_second(most: float | None) -> FrameOptions:
     """At most so many frames for the dense map's surface. Raises InputError: it is negative."""
     from bmask_slam.dense.growing.frames import FrameOptions  # noqa: PLC0415 - loads torch
 
+    if most is None:
+        return FrameOptions()
     if not 0 <= most < math.inf:
         raise InputError(f"--map-frames {most:g}: must be 0 or more frames a second")
     return FrameOptions(most)

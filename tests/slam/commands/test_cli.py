@@ -198,6 +198,8 @@ def test_every_shipped_configuration_runs(capsys, sequence: Path, tmp_path: Path
         (["run", "seq", "--set", "graph.relinearize_skip=0"], "= 0: must be at least 1"),
         (["live", "seq", "--max-frames", "0"], "--max-frames 0: must be a whole number"),
         (["live", "seq", "--map", "--map-frames", "nan"], "--map-frames nan: must be 0 or more"),
+        (["live", "seq", "--map-frames", "3"], "--map-frames 3: is for the dense map; give --map"),
+        (["run", "seq", "--mesh-voxel", "0.03"], "--mesh-voxel 0.03: is for the dense map; give"),
         (["workstation", "--port", "99999", "--token-file", "t"], "--port 99999: give one from 0"),
         (
             ["evaluate-segmentation", "--data", "x", "--images", "seq", "--plot", "none/a.png"],
