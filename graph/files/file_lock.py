@@ -9,8 +9,8 @@ from typing import IO, Any
 from bmask_slam.graph.errors import InputError
 
 
-def take_lock(file: IO[Any]) -> bool:
-    """Lock an open file until it is closed, or its process is killed.
+def take_lock(file: IO[Any] | int) -> bool:
+    """Lock an open file, or a folder, until it is closed, or its process is killed.
 
     False if another process holds the lock. Windows has no such locks: always True there.
     """

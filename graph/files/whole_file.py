@@ -10,14 +10,20 @@ import errno
 import os
 import secrets
 import shutil
+import sys
+import time
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.file_lock import take_lock
 
 PREFIX = ".part-"
+UNLOCKED_S = 10.0
+"""The longest time from the making of a folder to its lock."""
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -82,15 +88,55 @@ def writing(path: Path, cure: str = "free some space, or change its permissions"
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
     """An empty temporary folder beside ``path``; else as ``whole_file``."""
-    temporary = _temporary(path)
+    with folder_beside(path) as temporary:
+        yield temporary
+        remove(path)
+        os.replace(temporary, path)
+
+
+@contextmanager
+def folder_beside(path: Path, prefix: str = PREFIX) -> Iterator[Path]:
+    """An empty temporary folder beside ``path``, which is removed at the end if it is still there.
+
+    What killed processes left behind for the same ``path`` is removed at the beginning: the lock of
+    a folder tells whether its process lives.
+    """
+    prefix = f"{prefix}{zlib.crc32(os.fsencode(path.name)):08x}-"
+    for left in path.parent.glob(f"{prefix}*"):
+        _remove_abandoned(left)
+    temporary = path.with_name(f"{prefix}{secrets.token_hex(8)}")
     with _named(path, temporary):
         temporary.mkdir()
         try:
-            yield temporary
-            remove(path)
-            os.replace(temporary, path)
+            with _locked(temporary):
+                yield temporary
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Remove a folder that no process has locked; a young one may be about to be locked."""
+    with suppress(OSError):  # gone by now, or another user's
+        if time.time() - folder.lstat().st_mtime > UNLOCKED_S:
+            with _locked(folder) as is_mine:
+                if is_mine:
+                    shutil.rmtree(folder)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[bool]:
+    """Lock a folder, but no link; False where it is locked already, or nothing can be locked."""
+    if sys.platform == "win32":
+        yield False
+        return
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        is_locked = False
+        with suppress(OSError):  # a file system without locks
+            is_locked = take_lock(descriptor)
+        yield is_locked
+    finally:
+        os.close(descriptor)
 
 
 def open_plain(path: Path, mode: str) -> IO[Any]:

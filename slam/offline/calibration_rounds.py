@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 import signal
-import tempfile
 from pathlib import Path
 
 from bmask_slam.calibration.calibrate import (
@@ -21,6 +20,7 @@ from bmask_slam.calibration.report import Calibrated, format_calibration
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import frame_stamps
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.whole_file import folder_beside
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.run_folder.origin import find_sequence, read_origin
 from bmask_slam.sequences.cameras import write_camera
@@ -47,8 +47,7 @@ def calibrate_in_rounds(options: CalibrateOptions, rounds: int, quiet: bool = Fa
         raise InputError(f"--rounds {rounds}: must be a whole number of at least 1")
     out = check_options(options)
     sequence = options.sequence or find_sequence(options.run)
-    with tempfile.TemporaryDirectory(prefix=".calibrate-", dir=out.parent) as made:
-        folder = Path(made)
+    with folder_beside(out, ".calibrate-") as folder:
         options_1 = dataclasses.replace(options, out=folder / "camera-1.yaml", sequence=sequence)
         done = calibrate_run(options_1)
         before = done.before

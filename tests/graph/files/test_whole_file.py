@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import resource
 import shutil
+import sys
+from contextlib import ExitStack
 from pathlib import Path
+from subprocess import PIPE, Popen
 
 import pytest
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files import whole_file as whole_file_module
 from bmask_slam.graph.files.whole_file import check_target, whole_file, whole_folder
 
 
@@ -101,3 +105,40 @@ def test_a_folder_in_the_place_of_a_file_is_refused_and_kept(tmp_path: Path) -> 
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
     with pytest.raises(InputError, match="none is not there; make it first"):
         check_target(tmp_path / "none" / "a")
+
+
+LEAVE = """
+import os, sys
+from pathlib import Path
+from bmask_slam.graph.files.whole_file import folder_beside
+with folder_beside(Path(sys.argv[1])) as made:
+    (made / "rgb").mkdir()
+    print(made, flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_what_killed_processes_left_is_removed_by_the_next_for_the_same_target(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What another process works on stays, and what is of another target."""
+    path = tmp_path / "converted"
+    command = [sys.executable, "-c", LEAVE]
+    made: list[Path] = []
+    with ExitStack() as stack:
+        for target in (path, path, tmp_path / "other"):
+            process = Popen([*command, str(target)], stdin=PIPE, stdout=PIPE, text=True)
+            stack.enter_context(process)
+            stack.callback(process.kill)
+            assert process.stdout is not None
+            made.append(Path(process.stdout.readline().strip()))
+            if len(made) != 2:
+                process.kill()
+                process.wait()
+        assert all(folder.is_dir() for folder in made)
+        with whole_folder(path):
+            assert made[0].is_dir()  # too young
+        monkeypatch.setattr(whole_file_module, "UNLOCKED_S", 0.0)
+        with whole_folder(path):
+            assert [folder.is_dir() for folder in made] == [False, True, True]
+    assert path.is_dir()
