@@ -63,7 +63,10 @@ def open_bag_recording(path: Path, camera: Path | Camera | None) -> Recording:
         kind: sorted_list(bag_path / kind, np.array([p.stamp_s for p in places[kind]]), files[kind])
         for kind in places
     }
-    index = {f: p for kind in places for f, p in zip(files[kind], places[kind], strict=True)}
+    index: dict[Path, _Place] = {}
+    for kind, found_places in places.items():
+        for file, place in zip(files[kind], found_places, strict=True):
+            index.setdefault(file, place)  # the first of those with one stamp, as in the list
     messages = _BagMessages(bag_path, index, (topics.rgb, topics.depth))
     logger.info("%s: colour on %s, depth on %s", bag_path, topics.rgb, topics.depth)
     return Recording(
@@ -83,7 +86,7 @@ class _BagMessages:
         self._bag: Bag | None = None
         self._stream: Iterator[tuple[str, int, Any]] = iter(())
         self._read_to_ns: int | None = None  # None: no stream is open
-        self._kept: OrderedDict[tuple[str, float], Any] = OrderedDict()
+        self._kept: OrderedDict[_Place, Any] = OrderedDict()
 
     def colour(self, file: Path) -> Image:
         """A colour image (H, W, 3), red first. Raises InputError."""
@@ -95,13 +98,12 @@ class _BagMessages:
 
     def _message(self, file: Path) -> Any:
         place = self._index[file]
-        key = place.topic, place.stamp_s
         with self._lock:
-            if key not in self._kept:
-                self._read_to(place, key)
-            return self._kept[key]
+            if place not in self._kept:
+                self._read_to(place)
+            return self._kept[place]
 
-    def _read_to(self, place: _Place, key: tuple[str, float]) -> None:
+    def _read_to(self, place: _Place) -> None:
         """Read on until a message is among the kept ones. Raises InputError if it is not there."""
         at_ns = self._read_to_ns
         if at_ns is None or not at_ns <= place.time_ns <= at_ns + AHEAD_NS:
@@ -109,13 +111,13 @@ class _BagMessages:
             self._stream = self._bag.records(self._topics, place.time_ns - BEFORE_NS)
         for topic, time_ns, message in self._stream:
             self._read_to_ns = time_ns
-            self._kept[topic, stamp_s(message.header)] = message
+            self._kept.setdefault(_Place(topic, time_ns, stamp_s(message.header)), message)
             while len(self._kept) > KEPT_MESSAGES:
                 self._kept.popitem(last=False)
-            if key in self._kept and time_ns >= place.time_ns:
+            if place in self._kept:
                 return
             if time_ns > place.time_ns:
                 break
         self._read_to_ns = None
-        if key not in self._kept:
+        if place not in self._kept:
             raise InputError(f"{self._path}: no message of {place.stamp_s:.6f} s on {place.topic}")

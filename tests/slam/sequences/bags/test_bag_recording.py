@@ -45,6 +45,24 @@ def test_frames_are_read_in_any_order(tmp_path: Path, name: str, monkeypatch) ->
         assert np.array_equal(frame.depth_m, expected.depth_m, equal_nan=True)
 
 
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
+def test_of_messages_with_one_stamp_the_first_is_kept(tmp_path: Path, name: str) -> None:
+    """As of the lines of a list, whether or not the others are read before it."""
+    with BagMaker(tmp_path / name) as bag:
+        bag.write("/camera/rgb/camera_info", BEGIN_S, info_of(COLOUR))
+        for k in range(6):
+            stamp_s = BEGIN_S + k // 2
+            bag.write("/camera/rgb/image_color", stamp_s, image("rgb8", colour(k)))
+            depth = image("16UC1", np.full((24, 32), 1000 + k, np.uint16))
+            bag.write("/camera/depth/image", stamp_s, depth)
+    sequence = open_sequence(tmp_path / name)
+    assert len(sequence) == 3
+    for k in (0, 1, 2, 0, 2, 1):
+        frame = sequence.load(k)
+        assert np.array_equal(frame.rgb, colour(2 * k))
+        assert frame.depth_m[0, 0] == pytest.approx(1.0 + 0.002 * k)
+
+
 @pytest.mark.parametrize("name", ["a.bag", "a.db3"])
 def test_a_bag_is_converted(name: str, tmp_path: Path, capsys) -> None:
     path, out = write_bag(tmp_path / name), tmp_path / "out"
