@@ -15,6 +15,7 @@ from bmask_slam.graph.files.reading import read_lines
 from bmask_slam.graph.files.whole_file import whole_file
 
 if TYPE_CHECKING:
+    from bmask_slam.graph.smoother.isam2 import SolverError
     from bmask_slam.graph.smoother.smoother import Smoother
 
 logger = logging.getLogger(__name__)
@@ -49,12 +50,20 @@ def find_covariances(smoother: Smoother, stamps_s: dict[int, float]) -> Keyframe
     try:
         found = smoother.marginals()
     except SolverError as error:
-        logger.error("no covariances, the graph is singular (%s)", error)
+        logger.error("no covariances of the graph: %s", why_singular(error))
         return KeyframeCovariances(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 6, 6)))
     rows = np.flatnonzero(np.isin(found.keyframe_ids, list(stamps_s)))
     ids = found.keyframe_ids[rows]
     stamps = np.array([stamps_s[i] for i in ids.tolist()])
     return KeyframeCovariances(ids, stamps, found.keyframes[rows])
+
+
+def why_singular(error: SolverError) -> str:
+    """What a graph without covariances does not determine, and what helps."""
+    what = " ".join(map(str, error.variable or ("every variable",)))
+    reason = str(error).partition("\n")[0]
+    cure = f"add factors that determine {what}, such as a prior, or remove it"
+    return f"it is singular ({reason}) and does not determine {what}; {cure}"
 
 
 def write_covariances(path: Path, found: KeyframeCovariances) -> None:
@@ -84,7 +93,8 @@ def read_covariances(path: Path) -> KeyframeCovariances:
         raise InputError(f"{path}: no such file; run with --covariances to get it")
     rows = [_row(s, f"{path}:{n}") for n, s in read_lines(path, "run with --covariances again")]
     if not rows:
-        raise InputError(f"{path}: no covariance in the file; run with --covariances again")
+        why = "the run has no keyframe, or its graph was singular: log.txt says where, and a cure"
+        raise InputError(f"{path}: no covariance in the file; {why}")
     table = np.array(rows)
     covariances = np.zeros((len(table), 6, 6))
     covariances[:, *_UPPER] = table[:, 2:]

@@ -267,6 +267,7 @@ class Run:
         from bmask_slam.config.configuration import resolve  # noqa: PLC0415
         from bmask_slam.graph.smoother.isam2 import SolverError  # noqa: PLC0415
         from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig  # noqa: PLC0415
+        from bmask_slam.run_folder.covariance_file import why_singular  # noqa: PLC0415
 
         config = resolve(SmootherConfig, self._file(CONFIG), section="graph")
         path = self._file("graph")
@@ -275,8 +276,7 @@ class Run:
         try:
             found = smoother.marginals(known)
         except SolverError as error:
-            cure = "add factors that determine every variable"
-            raise InputError(f"{path}: no covariances, it is singular ({error}); {cure}") from error
+            raise InputError(f"{path}: no covariances, {why_singular(error)}") from error
         return (found.keyframe_ids, found.keyframes), (found.landmark_ids, found.landmarks)
 
     def _file(self, name: str, option: str = "") -> Path:

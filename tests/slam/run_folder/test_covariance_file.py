@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -10,8 +11,11 @@ from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.smoother.isam2 import SolverError
+from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.run_folder.covariance_file import (
     KeyframeCovariances,
+    find_covariances,
     read_covariances,
     write_covariances,
 )
@@ -80,3 +84,18 @@ def test_uncertainty_grows_along_the_path(tmp_path: Path) -> None:
     sigma_m = np.sqrt(np.trace(found.covariances[:, 3:, 3:], axis1=1, axis2=2))
     assert sigma_m[0] < 1e-3  # the world is the first keyframe's
     assert sigma_m[0] < sigma_m[1] < sigma_m[-1] < 0.05
+
+
+def test_a_singular_graph_is_said_with_the_variable_and_a_cure(tmp_path: Path, caplog) -> None:
+    """The file then has no line, which "run again" would not change."""
+
+    class Singular:
+        def marginals(self) -> None:
+            raise SolverError("Indeterminant linear system\nand much more", ("keyframe", 3))
+
+    found = find_covariances(cast("Smoother", Singular()), {0: 0.0})
+    said = caplog.messages[-1]
+    assert "singular (Indeterminant linear system) and does not determine keyframe 3; add" in said
+    write_covariances(tmp_path / "c.txt", found)
+    with pytest.raises(InputError, match=r"c\.txt: no covariance in the file; .* log\.txt says"):
+        read_covariances(tmp_path / "c.txt")
