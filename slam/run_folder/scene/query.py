@@ -12,7 +12,8 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError, did_you_mean, is_whole
-from bmask_slam.run_folder.semantic_files import SavedObject, SavedScene, read_scene
+from bmask_slam.run_folder.map_file import check_finished
+from bmask_slam.run_folder.semantic_files import OBJECTS, SavedObject, SavedScene, read_scene
 from bmask_slam.semantics.objects.relations import RELATIONS, distance_m, relations
 
 
@@ -74,6 +75,13 @@ def query(run: Path, label: str | None, most: int | None = None) -> Answer:
     return ask(run, Asked(label, most=most))
 
 
+def finished_scene(run: Path) -> SavedScene:
+    """As `read_scene`; for a run that was killed and can go on, InputError says that."""
+    if not (run / OBJECTS).is_file():
+        check_finished(run)
+    return read_scene(run)
+
+
 def ask(run: Path, asked: Asked) -> Answer:
     """The objects of a run that are asked for.
 
@@ -81,7 +89,7 @@ def ask(run: Path, asked: Asked) -> Answer:
         InputError: there is no run, it has no objects.json, its label set lacks a label, or there
             is no object of the id that a relation names.
     """
-    scene = read_scene(run)
+    scene = finished_scene(run)
     counts = dict(sorted(Counter(o.label for o in scene.objects).items()))
     for name in (asked.label, None if is_whole(asked.other) else asked.other or None):
         if name is not None and name not in scene.names:

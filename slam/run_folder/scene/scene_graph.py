@@ -15,7 +15,8 @@ from bmask_slam.graph.files.reading import read_table
 from bmask_slam.graph.files.whole_file import whole_file
 from bmask_slam.run_folder.landmark_file import LANDMARKS
 from bmask_slam.run_folder.object_picture import distinct_colour
-from bmask_slam.run_folder.semantic_files import LABELS, SavedObject, SavedScene, read_scene
+from bmask_slam.run_folder.scene.query import finished_scene
+from bmask_slam.run_folder.semantic_files import LABELS, SavedObject, SavedScene
 from bmask_slam.semantics.objects.boxes3d import OrientedBox, box_around
 from bmask_slam.semantics.objects.relations import relations
 
@@ -38,7 +39,7 @@ def write_scene_graph(run: Path, out: Path) -> str:
     Metres, in the run's world frame; boxes stand upright. The room is the box around nearly all
     landmarks. Raises InputError for a run without objects or landmarks.
     """
-    scene, points = read_scene(run), _landmarks(run)
+    scene, points = finished_scene(run), _landmarks(run)
     found = relations([o.box for o in scene.objects], scene.up_world)
     inner = _within(points, scene.up_world)
     surfaces = _surfaces(run, scene, points)
@@ -76,7 +77,7 @@ def write_object_points(run: Path, out: Path) -> str:
     Raises:
         InputError: a run without objects or landmarks, or no landmark lies on an object.
     """
-    scene = read_scene(run)
+    scene = finished_scene(run)
     columns = read_ply(run / LANDMARKS, (*POINTS[:3], "id"))
     ids, points, colours, owners = columns["id"], [], [], []
     for number, o in enumerate(scene.objects):

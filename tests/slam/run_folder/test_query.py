@@ -264,3 +264,16 @@ def test_no_run_and_no_place_are_refused(
     assert "nowhere: no such folder; give that of a run" in capsys.readouterr().err
     assert main(["query", str(run), "--near", "1", "2", "nan"]) == 1
     assert "--near 1 2 nan: give three finite coordinates" in capsys.readouterr().err
+
+
+def test_a_run_that_was_killed_and_can_go_on_is_said(tmp_path: Path, capsys) -> None:
+    run, out = tmp_path / "run", tmp_path / "a"
+    run.mkdir()
+    (run / "checkpoint").write_text("")
+    for words in (
+        ["query", f"{run}"],
+        ["export", f"{run}", "--format", "scene-graph", "--out", f"{out}"],
+        ["export", f"{run}", "--format", "objects-ply", "--out", f"{out}"],
+    ):
+        assert main(words) == 1
+        assert f"bmask-slam run --resume {run}" in capsys.readouterr().err
