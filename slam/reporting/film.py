@@ -23,7 +23,9 @@ from bmask_slam.reporting.film_cloud import (
     DEPTH_STEP_PX,
     Shot,
     in_image,
+    keyframe_stamps,
     make_cloud,
+    path_breaks,
     sampled_points,
 )
 from bmask_slam.reporting.film_view import SWING_DEG, Colour, MapPicture, MapView, make_view
@@ -35,8 +37,7 @@ from bmask_slam.semantics.objects.boxes3d import EDGES
 from bmask_slam.semantics.segmenters.upright import turned
 from bmask_slam.sequences.sequence import open_sequence
 
-FILM = "film.gif"
-KINDS = (".gif", ".webp", ".mp4")
+FILM, KINDS = "film.gif", (".gif", ".webp", ".mp4")
 STRIP_PX, GAP_PX = 30, 4
 LAST_S = 2.0
 """The last picture stays so long before the film begins again."""
@@ -178,8 +179,7 @@ class _Film:
         if not len(cloud.first):
             raise InputError(f"{self._run.path}: no depth in the frames; there is nothing to film")
         view = make_view(cloud, poses, up / np.linalg.norm(up), self._size)
-        frames = self._run.frames
-        made_s = frames.timestamps_s[frames.keyframe_ids >= 0]
+        made_s, self._breaks = keyframe_stamps(self._run), path_breaks(self._run, self._shots)
         for number, shot in enumerate(self._shots):
             there = [o for o in self._objects if o.first_seen_s <= shot.timestamp_s]
             left, left_names = self._frame(shot, there)
@@ -217,7 +217,7 @@ class _Film:
         drawn = MapPicture(view, float(turn_deg), len(poses))
         for o in there:
             drawn.edges(o.box.corners_world[EDGES], self._colours[o.label])
-        drawn.line(poses[:, :3, 3], PATH_COLOUR, 2)
+        drawn.lines(np.split(poses[:, :3, 3], self._breaks), PATH_COLOUR, 2)
         drawn.frustum(poses[-1], self._camera, CAMERA_COLOUR)
         if not there:
             return drawn.image, []

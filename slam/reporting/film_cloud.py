@@ -14,6 +14,8 @@ from bmask_slam.graph.arrays import Array, Bytes, Floats, Image, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.ply import POINTS, read_ply
 from bmask_slam.graph.geometry import inverse, transform
+from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, nearest_indices
+from bmask_slam.run_folder.reader import Run
 
 MAX_POINTS = 250_000
 STEP_PX, DEPTH_STEP_PX = 6, 4
@@ -48,6 +50,22 @@ class Shot:
     T_world_camera: Array
     points_world: Floats
     colours: Bytes
+
+
+def keyframe_stamps(run: Run) -> Array:
+    """Stamps (K,) of the keyframes that are left; of all that were made if the run was killed."""
+    made_s = run.frames.timestamps_s[run.frames.keyframe_ids >= 0]
+    is_ended = (run.path / "keyframes.txt").is_file()
+    return run.keyframes.timestamps_s if len(made_s) and is_ended else made_s
+
+
+def path_breaks(run: Run, shots: Sequence[Shot]) -> Ints:
+    """Numbers of the shots before which a frame has no pose, so that the path is not known."""
+    frames_s, poses_s = run.frames.timestamps_s, run.trajectory.timestamps_s
+    near = nearest_indices(poses_s, frames_s)
+    unknown_s = np.sort(frames_s[np.abs(poses_s[near] - frames_s) > MAX_STAMP_ERROR_S])
+    before = np.searchsorted(unknown_s, [shot.timestamp_s for shot in shots])
+    return np.flatnonzero(np.diff(before)) + 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -130,12 +131,12 @@ class MapPicture:
         points[~ahead] = np.nan
         return self._camera.project(points), ahead
 
-    def line(self, points_world: Array, colour: Colour, width_px: int) -> None:
-        """A line through points (N, 3), with a light border."""
-        pixels, ahead = self.place(points_world)
-        path = np.rint(pixels[ahead]).astype(np.int32)
+    def lines(self, parts_world: Sequence[Array], colour: Colour, width_px: int) -> None:
+        """A line through the points (N, 3) of each part, with a light border."""
+        placed = [self.place(points) for points in parts_world if len(points)]
+        paths = [np.rint(pixels[ahead]).astype(np.int32) for pixels, ahead in placed]
         for stroke, width in (((255, 255, 255), width_px + 2), (colour, width_px)):
-            cv2.polylines(self.image, [path], False, stroke, width, cv2.LINE_AA)
+            cv2.polylines(self.image, paths, False, stroke, width, cv2.LINE_AA)
 
     def edges(self, ends_world: Array, colour: Colour) -> None:
         """Straight lines between ends (N, 2, 3)."""

@@ -19,9 +19,17 @@ from bmask_slam.graph.geometry import make_pose
 from bmask_slam.offline import runner
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.reporting.film import GAP_PX, STRIP_PX, FilmOptions, write_film
-from bmask_slam.reporting.film_cloud import DEPTH_STEP_PX, Shot, make_cloud, sampled_points
+from bmask_slam.reporting.film_cloud import (
+    DEPTH_STEP_PX,
+    Shot,
+    keyframe_stamps,
+    make_cloud,
+    path_breaks,
+    sampled_points,
+)
 from bmask_slam.reporting.film_view import BACKGROUND, MapPicture, make_view
 from bmask_slam.run_folder.origin import find_sequence
+from bmask_slam.run_folder.reader import Run
 from bmask_slam.sequences.cameras import read_camera, write_camera
 
 CAMERA = Camera(64, 48, 60, 60, 31.5, 23.5)
@@ -126,6 +134,42 @@ def test_frames_of_a_camera_that_is_mounted_sideways_are_upright(run: Path, tmp_
     expected = cv2.resize(np.rot90(plain, 3), (width, len(again)))
     off, upside_down = (np.abs(again - e).mean() for e in (expected, expected[::-1, ::-1]))
     assert off < 0.5 * upside_down
+
+
+def test_the_path_breaks_at_losses_and_culled_keyframes_do_not_count(
+    run: Path, tmp_path: Path
+) -> None:
+    lossy = shutil.copytree(run, tmp_path / "run")
+    whole = Run(run)
+    stamps_s = whole.trajectory.timestamps_s
+    shots = [replace(shot(k, wall(2.0), (0, 0, 0)), timestamp_s=stamps_s[k]) for k in (6, 8, 11)]
+    assert path_breaks(whole, shots).tolist() == []
+    assert len(keyframe_stamps(whole)) == len(whole.keyframes.ids) > 1
+    for name, left_out in (("trajectory.txt", (9, 10)), ("keyframes.txt", (1,))):
+        lines = (run / name).read_text().splitlines(keepends=True)
+        head = [line for line in lines if line.startswith("#")]
+        rows = [line for line in lines if not line.startswith("#")]
+        kept = [row for k, row in enumerate(rows) if k not in left_out]
+        (lossy / name).write_text("".join([*head, *kept]))
+    assert path_breaks(Run(lossy), shots).tolist() == [2]
+    assert len(keyframe_stamps(Run(lossy))) == len(whole.keyframes.ids) - 1
+    (lossy / "keyframes.txt").unlink()
+    assert len(keyframe_stamps(Run(lossy))) == len(whole.keyframes.ids)
+    assert write_film(FilmOptions(lossy, tmp_path / "f.gif", None, 1, 5, 200)).is_file()
+
+
+def test_the_parts_of_a_path_are_not_joined() -> None:
+    shots = [shot(k, wall(2.0), (0.5 * k, 0, 0)) for k in range(4)]
+    cloud = make_cloud(shots, CAMERA, Path("no dense map"))
+    path = np.array([[0.0, 0, 1], [0.3, 0, 1], [1.2, 0, 1], [1.5, 0, 1]])
+    poses = np.stack([s.T_world_camera for s in shots])
+    view = make_view(cloud, poses, UP, (80, 60))
+    drawn = [MapPicture(view, 0.0, 0) for _ in range(2)]
+    for picture, breaks in zip(drawn, ([], [2, 9]), strict=True):
+        picture.lines(np.split(path, breaks), (0, 0, 255), 2)
+    column, row = np.rint(drawn[0].place(path[1:3].mean(axis=0)[None])[0][0]).astype(int)
+    one, two = (picture.image[row, column].tolist() for picture in drawn)
+    assert one == [0, 0, 255] and two == list(BACKGROUND)
 
 
 def test_an_mp4_has_its_pictures_and_its_end(run: Path, tmp_path: Path) -> None:
