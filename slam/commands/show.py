@@ -48,12 +48,12 @@ def add_view(commands: Commands) -> None:
 
 
 def _view(arguments: argparse.Namespace) -> int:
-    from bmask_slam.run_folder.map_file import read_run
-    from bmask_slam.viewer.replay import ReplayOptions, replay
+    from bmask_slam.viewer.replay import ReplayOptions, read_shown, replay
     from bmask_slam.viewer.scene import Scene
 
     where = view_options(arguments, window=True)
-    read_run(arguments.run)  # before a window opens, or a recording of before is replaced
+    # Before a window opens, or a recording of before is replaced.
+    read_shown(arguments.run, arguments.sequence)
     scene = Scene(arguments.run.name, where)
     options = ReplayOptions(
         arguments.sequence, not arguments.no_images, paced=where.foxglove_port > 0

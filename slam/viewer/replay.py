@@ -12,14 +12,25 @@ import numpy as np
 from bmask_slam.events import EVENTS, Event, read_events
 from bmask_slam.graph.arrays import Array, Arrays, Bytes
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import RelativePose
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.files.ply import POINTS, read_ply
-from bmask_slam.graph.trajectory import MAX_STAMP_ERROR_S, Trajectory, nearest_indices
+from bmask_slam.graph.trajectory import (
+    MAX_STAMP_ERROR_S,
+    Trajectory,
+    nearest_indices,
+    read_tum,
+)
+from bmask_slam.run_folder.folder import trajectory_files
 from bmask_slam.run_folder.frame_file import FRAMES, FrameTable, read_frames
-from bmask_slam.run_folder.map_file import SavedRun, read_run
+from bmask_slam.run_folder.landmark_file import LANDMARKS
+from bmask_slam.run_folder.map_file import SavedRun, check_finished, read_run
+from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.run_folder.semantic_files import OBJECTS, read_objects
 from bmask_slam.semantics.instances.overlay import class_colour
+from bmask_slam.sequences.sequence import open_sequence
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 from bmask_slam.viewer.replay_pictures import ReplayPictures
 from bmask_slam.viewer.scene import PATH_COLOUR, Scene
@@ -28,6 +39,8 @@ from bmask_slam.viewer.shown import Box, Ellipsoid
 logger = logging.getLogger(__name__)
 
 MAX_DENSE_POINTS = 300_000
+GRAPH, ENOUGH = "graph", (FRAMES, LANDMARKS, "trajectory.txt")
+"""What a run is shown by that has no graph."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +64,8 @@ def replay(path: Path, scene: Scene, options: ReplayOptions | None = None) -> in
     Raises:
         InputError: a file of it is missing or broken.
     """
-    options, run = options or ReplayOptions(), read_run(path)
+    options = options or ReplayOptions()
+    run = read_shown(path, options.sequence)
     scene.log_camera(run.camera)
     trajectory = run.trajectories["trajectory.txt"]
     table = read_frames(path / FRAMES)
@@ -64,7 +78,7 @@ def replay(path: Path, scene: Scene, options: ReplayOptions | None = None) -> in
         frames = _frame_results(table, trajectory, _events(path))
     except ValueError as error:
         raise InputError(f"{path / FRAMES}: {error}; run again") from error
-    uncertain = _show_uncertainty(path, scene)
+    uncertain = _show_uncertainty(path, scene) if len(run.tables) else {}
     began_s = time.monotonic()
     for line, frame in enumerate(frames):
         if options.paced:
@@ -78,6 +92,22 @@ def replay(path: Path, scene: Scene, options: ReplayOptions | None = None) -> in
             pictures.show(line, frame.timestamp_s, scene)
     scene.log_line("world/trajectory", trajectory.positions_world, PATH_COLOUR)
     return len(frames)
+
+
+def read_shown(path: Path, sequence: Path | None) -> SavedRun:
+    """A run to be shown; one without a graph, as after --localise, has its poses and landmarks.
+
+    Their camera is that of its recording, which may be in ``sequence`` now. Raises InputError.
+    """
+    check_finished(path)
+    if (path / GRAPH).exists() or not all((path / name).is_file() for name in ENOUGH):
+        return read_run(path)
+    camera = open_sequence(sequence or find_sequence(path)).camera
+    none = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    trajectories = {file.name: read_tum(file) for file in trajectory_files(path)}
+    landmarks = read_ply(path / LANDMARKS, POINTS)
+    no_graph = FactorTables(), camera, SmootherConfig(), np.zeros(0)
+    return SavedRun(path, *no_graph, trajectories, none, landmarks)
 
 
 def _events(run: Path) -> dict[int, list[Event]]:

@@ -19,6 +19,7 @@ from synthetic_view import CAMERA, PlaneViews, make_features
 from bmask_slam.cli import main
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.live.display import Display
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.processes.dense_messages import Preview
@@ -134,6 +135,22 @@ def test_a_run_whose_masks_lack_images_is_shown_without_them(tmp_path, caplog) -
     scene.close()
     assert "shown without masks" in caplog.text
     assert entities(tmp_path / "a.rrd")["/world/camera/image"] == len(frames)
+
+
+def test_a_run_that_was_localised_in_a_map_is_shown_in_it(recorded, tmp_path: Path) -> None:
+    """Without graph and keyframes: its path, the map's landmarks, and the images."""
+    options = RunOptions(make_sequence(tmp_path / "seq"), out=tmp_path / "run", quiet=True)
+    run = runner.run(options, FakeSystem).folder
+    (run / "graph").unlink()
+    (run / "map").unlink()
+    (run / "keyframes.txt").write_text("# timestamp_s tx ty tz qx qy qz qw\n")
+    shutil.copy(recorded / "run" / "landmarks.ply", run)
+    assert main(["view", str(run), "--record", str(tmp_path / "a.rrd")]) == 0
+    rows = entities(tmp_path / "a.rrd")
+    assert rows["/world/camera"] == len(read_tum(run / "trajectory.txt"))
+    assert rows["/plots/status/status"] == len(read_frames(run / "frames.csv"))
+    for path in ("/world/landmarks", "/world/trajectory", "/world/camera/image"):
+        assert rows[path] >= 1, path
 
 
 def columns(path: Path, entity: str, name: str) -> list[NDArray[Any]]:
