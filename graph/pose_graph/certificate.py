@@ -62,6 +62,12 @@ def certify(result: PoseGraphResult) -> Certificate:
     return Certificate(status, smallest, solver.poses, cost)
 
 
+def check_certifiable(graph: PoseGraph) -> None:
+    """Raise InputError for a 2-D graph."""
+    if graph.is_planar:
+        raise InputError("--certify: is of 3-D graphs; leave it out for a 2-D one")
+
+
 def certified_rotations(graph: PoseGraph) -> tuple[Array | None, float]:
     """Poses (N, 4, 4) whose rotations are certified, and the smallest eigenvalue, or None.
 
@@ -73,8 +79,7 @@ def certified_rotations(graph: PoseGraph) -> tuple[Array | None, float]:
     Raises:
         InputError: a 2-D graph.
     """
-    if graph.is_planar:
-        raise InputError("--certify: is of 3-D graphs; leave it out for a 2-D one")
+    check_certifiable(graph)
     weights = mean_information(graph.information[:, :3, :3])
     measurements = [
         gtsam.BinaryMeasurementRot3(

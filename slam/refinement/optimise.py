@@ -15,7 +15,7 @@ from bmask_slam.graph.files.whole_file import check_target
 from bmask_slam.graph.g2o.landmark_graphs import write_landmark_graph
 from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
 from bmask_slam.graph.g2o.pose_graphs import read_g2o, write_g2o
-from bmask_slam.graph.pose_graph.certificate import Certificate, certify
+from bmask_slam.graph.pose_graph.certificate import Certificate, certify, check_certifiable
 from bmask_slam.graph.pose_graph.optimisation import (
     Method,
     PoseGraphConfig,
@@ -68,6 +68,8 @@ def optimise_file(
         check_picture(options.plot)
     graph, certificate = read_g2o(file, options.repair), None
     try:
+        if options.certify:
+            check_certifiable(graph)
         result = optimise_pose_graph(graph, PoseGraphConfig(method=options.method), progress)
         if options.certify:
             certificate = certify(result)

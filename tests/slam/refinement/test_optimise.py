@@ -1,6 +1,7 @@
 """``bmask-slam optimise`` from a g2o file to a g2o file and a picture."""
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import matplotlib.image
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from bmask_slam import cli
 from bmask_slam.graph.g2o.pose_graphs import read_g2o
+from bmask_slam.refinement import optimise
 
 SIDE = 8
 
@@ -110,3 +112,12 @@ def test_errors_are_one_line(
     assert errors.startswith("error: ")
     assert errors.count("\n") == 1
     assert not Path("b.g2o").exists()
+
+
+def test_a_certificate_of_a_2d_graph_is_refused_before_the_work(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = Mock(side_effect=AssertionError("optimised"))
+    monkeypatch.setattr(optimise, "optimise_pose_graph", asked)
+    assert cli.main(["optimise", str(file), "--out", str(tmp_path / "b.g2o"), "--certify"]) == 1
+    asked.assert_not_called()
