@@ -118,9 +118,12 @@ class VoxelCarver:
         free = np.setdiff1d(np.concatenate([none, *self._free]), occupied)
         codes = np.concatenate([occupied, free])
         keys = _unpacked(codes)
-        if not len(keys) or np.abs(keys).max() >= LIMIT:
-            reach_m = LIMIT * self._resolution_m
+        reach_m, far = LIMIT * self._resolution_m, int(np.abs(keys).max(initial=0))
+        if not len(keys):
             raise InputError(f"no surface within {reach_m:g} m; choose a larger --resolution")
+        if far >= LIMIT:
+            what = f"no surface may be beyond {reach_m:g} m, and a point is {far / LIMIT:.3g} times"
+            raise InputError(f"{what} as far away; choose a larger --resolution, or remove it")
         is_occupied = np.arange(len(codes)) < len(occupied)
         return VoxelMap(self._resolution_m, self._T, keys, is_occupied)
 

@@ -42,6 +42,7 @@ MIN_FLOOR_POINTS = 200
 GRAVITY_DEG, LABELLED_DEG = 6.0, 75.0
 """The floor's normal may be so far from gravity, and a labelled floor's from the cameras' up."""
 MIN_RESOLUTION_M, MAX_RESOLUTION_M = 0.01, 1.0
+CLOUD = "dense/cloud.ply"
 MAX_CELLS = 1 << 27
 """Of a grid: 580 m square at 5 cm. With a few points that are wrong by far it would be larger."""
 
@@ -99,7 +100,8 @@ def export_drive_map(
     spans = np.ptp(voxels.keys[:, :2], axis=0) + 1
     if spans.prod() > MAX_CELLS:
         size = " x ".join(f"{span * options.resolution_m:.0f}" for span in spans)
-        raise InputError(f"{run}: its map is {size} m large; choose a larger --resolution")
+        cure = "choose a larger --resolution, or remove points that are far away"
+        raise InputError(f"{run / CLOUD}: its map is {size} m large; {cure}")
     grid = grid_of(voxels, options.low_m, options.high_m)
     height, width = grid.cells.shape
     shares = [100 * float((grid.cells == kind).mean()) for kind in (OCCUPIED, FREE)]
@@ -134,7 +136,10 @@ def voxel_map(run: Path, resolution_m: float) -> tuple[VoxelMap, str]:
             carver.carve(depth_m, saved.camera, keyframe.T_world_camera)
             carved += 1
     logger.info("%s: free space by the depth of %d keyframes; %s", run, carved, frame)
-    return carver.voxels(), frame
+    try:
+        return carver.voxels(), frame
+    except InputError as error:
+        raise InputError(f"{run / CLOUD}: {error}") from error
 
 
 def map_frame(saved: SavedMap, cloud: DenseCloud) -> tuple[Array, str]:

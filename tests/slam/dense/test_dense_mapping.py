@@ -591,7 +591,14 @@ def test_a_map_to_drive_on_that_is_too_large_by_a_few_points_is_refused(
             cloud[axis][rows] = value
     write_ply(run / "dense" / "cloud.ply", cloud)
     assert main(arguments) == 1
-    assert "m large; choose a larger --resolution" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "m large; choose a larger --resolution" in said
+    assert f"error: {run / 'dense' / 'cloud.ply'}: " in said
+    cloud["x"][-3:] = 1e4
+    write_ply(run / "dense" / "cloud.ply", cloud)
+    assert main(arguments) == 1
+    said = capsys.readouterr().err
+    assert f"error: {run / 'dense' / 'cloud.ply'}: no surface may be beyond 1638.4 m" in said
 
 
 def occupied_share(run: Path, yaml: Path, points_world: Array) -> float:
