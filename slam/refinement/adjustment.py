@@ -104,6 +104,7 @@ def adjust_run(
     if plot is not None:
         check_picture(plot)
     run = read_run(path)
+    saved = read_map(path) if (path / MAP).is_file() else None  # before ``out`` is replaced
     truth = None
     if options.reference is not None:
         truth = read_reference(options.reference, frame_stamps(path / "trajectory.txt"))
@@ -114,7 +115,6 @@ def adjust_run(
             adjustment = adjust(run.tables, run.camera, run.config, config, progress)
         except InputError as error:
             raise InputError(f"{path / 'graph'}: {error}") from error
-        saved = read_map(path) if (path / MAP).is_file() else None
         frames = _with_frames(run, saved[0]) if saved else None
         trajectory = _write_run(run, before, adjustment, folder, saved)
         pair = run.trajectories["trajectory.txt"], trajectory

@@ -276,6 +276,16 @@ def test_only_the_graph_section_of_the_configuration_is_read(kitchen: Path, tmp_
         read_run(other)
 
 
+def test_a_damaged_map_is_refused_before_the_output_is_replaced(
+    kitchen: Path, tmp_path: Path, capsys
+) -> None:
+    run, out = (shutil.copytree(kitchen, tmp_path / name) for name in ("run", "out"))
+    (run / "map").write_bytes((kitchen / "map").read_bytes()[:3000])
+    assert optimise(run, "--out", out, "--overwrite") == 1
+    assert f"{run / 'map'}: not a saved map" in capsys.readouterr().err
+    assert {p.name for p in out.iterdir()} == {p.name for p in kitchen.iterdir()}
+
+
 def test_impossible_options_are_refused(capsys, kitchen: Path, tmp_path: Path) -> None:
     def error(*words: object) -> str:
         assert optimise(*words) == 1
