@@ -59,13 +59,11 @@ def optimise_file(
     If certified rotations lead to a lower cost, that solution is the result.
 
     Raises:
-        InputError: the output's folder is not there, the type of the picture is not known, or
-            ``read_g2o`` or the solver refuses the file.
+        InputError: the output's folder is not there, the output is the input, the type of the
+            picture is not known, or ``read_g2o`` or the solver refuses the file.
     """
     options = options or GraphOptions()
-    check_target(out)
-    if options.plot is not None:
-        check_picture(options.plot)
+    _check_paths(file, out, options.plot)
     graph, certificate = read_g2o(file, options.repair), None
     try:
         if options.certify:
@@ -80,6 +78,16 @@ def optimise_file(
     if options.plot is not None:
         _draw(result, options.plot)
     return result, certificate
+
+
+def _check_paths(file: Path, out: Path, plot: Path | None) -> None:
+    """Raise InputError for outputs that cannot be written, or would replace the input."""
+    check_target(out)
+    if plot is not None:
+        check_picture(plot)
+    for target in filter(None, (out, plot)):
+        if target.resolve() == file.resolve():
+            raise InputError(f"{target}: is the input, which stays as it is; choose another --out")
 
 
 def _better(result: PoseGraphResult, certificate: Certificate) -> PoseGraphResult:
@@ -101,9 +109,7 @@ def adjust_file(
     Raises:
         InputError: as ``optimise_file``.
     """
-    check_target(out)
-    if plot is not None:
-        check_picture(plot)
+    _check_paths(file, out, plot)
     tables, camera = read_landmark_graph(file, repair=repair)
     before = GraphSnapshot.of(tables)
     try:

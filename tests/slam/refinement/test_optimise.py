@@ -91,6 +91,7 @@ def test_quiet_prints_only_the_path(capsys, file: Path, tmp_path: Path) -> None:
     [
         (["none.g2o", "--out", "b.g2o"], "none.g2o: no such file"),
         (["run", "--out", "b"], "holds no graph; give the folder of a run"),
+        (["in.g2o", "--out", "./in.g2o"], "in.g2o: is the input, which stays as it is"),
         (["in.g2o", "--out", "no/b.g2o"], "the folder no is not there"),
         (["in.g2o", "--out", "."], "a folder; give the name of a file"),
         (["in.g2o", "--out", "b.g2o", "--plot", "b.gif"], "cannot draw '.gif'"),
