@@ -26,8 +26,10 @@ def new_folder(out: Path) -> Iterator[Path]:
     """A temporary folder beside ``out``, renamed to ``out`` when the block ends without an error.
 
     Raises:
-        InputError: ``out`` is a file, holds something, or cannot be written.
+        InputError: ``out`` is a file, holds something, has no name, or cannot be written.
     """
+    if not out.name:  # of the working directory, which would be another one afterwards
+        raise InputError(f"{out}: has no name; choose a new folder as --out")
     if out.is_dir() and any(out.iterdir()):
         raise InputError(f"{out}: the folder is not empty; choose another --out or delete it")
     if out.exists() and not out.is_dir():

@@ -395,3 +395,9 @@ def test_each_row_of_a_rolling_shutter_is_seen_from_its_own_pose(tmp_path: Path,
         assert row == 60 or np.abs(shown[row].astype(int) - middle[row]).max() > 10
     colours = [cv2.imread(str(folder / "rgb/1.000000.png"))[60] for folder in (rolled, then)]
     assert np.abs(colours[0].astype(int) - colours[1]).mean() < 1
+
+
+def test_the_working_directory_is_no_new_folder(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"^\.: has no name; choose a new folder"):
+        render_sequence(RenderConfig("office", 1), Path())
