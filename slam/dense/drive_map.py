@@ -45,6 +45,7 @@ MIN_RESOLUTION_M, MAX_RESOLUTION_M = 0.01, 1.0
 CLOUD = "dense/cloud.ply"
 MAX_CELLS = 1 << 27
 """Of a grid: 580 m square at 5 cm. With a few points that are wrong by far it would be larger."""
+TOO_LARGE = "choose a larger --resolution, or remove points that are far away"
 
 
 @dataclass(frozen=True)
@@ -100,8 +101,7 @@ def export_drive_map(
     spans = np.ptp(voxels.keys[:, :2], axis=0) + 1
     if spans.prod() > MAX_CELLS:
         size = " x ".join(f"{span * options.resolution_m:.0f}" for span in spans)
-        cure = "choose a larger --resolution, or remove points that are far away"
-        raise InputError(f"{run / CLOUD}: its map is {size} m large; {cure}")
+        raise InputError(f"{run / CLOUD}: its map is {size} m large; {TOO_LARGE}")
     grid = grid_of(voxels, options.low_m, options.high_m)
     height, width = grid.cells.shape
     shares = [100 * float((grid.cells == kind).mean()) for kind in (OCCUPIED, FREE)]
