@@ -245,8 +245,9 @@ class SlamSystem(SavedSystem):
     @stage("semantics")
     def _label(self, frame: Frame, keyframe: Keyframe, static: StaticFeatures) -> None:
         self.moving_objects.store_keyframe(keyframe, static)
-        first = self.map.world.in_segment(keyframe.segment) == [keyframe]
-        self.semantics.observe(frame, keyframe, urgent=first or self.moving_objects.crowd(static))
+        begins_segment = self.map.world.in_segment(keyframe.segment) == [keyframe]
+        urgent = begins_segment or self.moving_objects.is_crowded(static)
+        self.semantics.observe(frame, keyframe, urgent)
 
     def _join_segments(self, tracked: Tracked) -> Tracked:
         """Search the frame in other map segments; if it is recognised, they are joined."""

@@ -88,7 +88,7 @@ class MovingObjectFilter:
         views = self.keyframe_views.posed(self._camera_tracker.segment, self._map)
         predicted = self._camera_tracker.prediction()
         static = self.static_features_at(frame, features, predicted, views)
-        doubted = self.crowd(static)
+        doubted = self.is_crowded(static)
         settled = max(self.config.min_static, self.config.settled_share * len(features))
         if predicted is not None and doubted and static.static_count < settled:
             found = self._camera_tracker.preview(features)
@@ -97,7 +97,7 @@ class MovingObjectFilter:
             static = self.static_features_at(frame, features, found, views)
         return self._replenished(frame, features, static, views)
 
-    def crowd(self, static: StaticFeatures) -> bool:
+    def is_crowded(self, static: StaticFeatures) -> bool:
         """Whether most features of a frame seem to move."""
         return bool(static.moving.sum() > self.config.doubt_share * len(static.moving))
 

@@ -115,7 +115,8 @@ def test_the_masks_of_a_keyframe_in_a_crowd_are_used_before_the_next_frame(monke
     system = system_with(segmenter)
     system.process(FRAMES[0])
     system.process(FRAMES[1])
-    monkeypatch.setattr(system.moving_objects, "crowd", lambda static: crowded.append(1) or True)
+    asked = system.moving_objects, "is_crowded"
+    monkeypatch.setattr(*asked, lambda static: crowded.append(static) or True)
     system.process(FRAMES[2])
     system.process(FRAMES[3])
     assert crowded
