@@ -19,10 +19,7 @@ from tempfile import TemporaryDirectory
 from benchmarks.moving.no_harm import other_keypoints
 from benchmarks.pages import table
 from benchmarks.paths import SHARED
-from bmask_slam.config.configuration import resolve
-from bmask_slam.evaluation import evaluate
-from bmask_slam.offline.runner import RunOptions, run
-from bmask_slam.system_config import SystemConfig
+from benchmarks.suite.never_lost import Input, outcome
 
 CROWD = SHARED / "bonn_crowd"
 FIRST = (0, 60, 110, 150, 170, 190)
@@ -48,14 +45,8 @@ def part_from(first: int, into: Path) -> Path:
 
 def ates_mm(sequence: Path, stride: int, repeats: int) -> list[float]:
     """The errors of runs by default options, each with another grid of keypoints."""
-    found = []
-    for repeat in range(repeats):
-        config = resolve(SystemConfig, None, [other_keypoints(repeat)])
-        with TemporaryDirectory() as folder:
-            out = Path(folder) / "run"
-            run(RunOptions(sequence, config, out=out, stride=stride, quiet=True))
-            found.append(1e3 * evaluate(out, sequence).value("ate_rmse"))
-    return found
+    entry = Input(CROWD.name, stride=stride)
+    return [outcome(entry, sequence, [other_keypoints(k)]).ate_mm for k in range(repeats)]
 
 
 def _row(name: str, errors_mm: Sequence[float]) -> tuple[str, str]:

@@ -16,7 +16,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Bytes
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import import_extra
-from bmask_slam.viewer.options import LOCAL, ViewOptions, writing
+from bmask_slam.viewer.options import LOCAL, ViewOptions, naming
 from bmask_slam.viewer.shown import Box, Ellipsoid, Points, SegmentedImage, quaternion
 
 if TYPE_CHECKING:  # it loads torch
@@ -51,7 +51,7 @@ class FoxgloveTransport:
         self.address = ""
         self._file = options.foxglove_file
         if self._file is not None:
-            with writing(self._file):
+            with naming(self._file):
                 self._sink = self._fg.open_mcap(
                     self._file, allow_overwrite=True, context=self._context
                 )
@@ -247,7 +247,7 @@ class FoxgloveTransport:
         if self._file is None:
             self._sink.stop()
         else:
-            with writing(self._file):
+            with naming(self._file):
                 self._sink.close()
 
     def _entity(self, path: str, **primitives: Any) -> None:

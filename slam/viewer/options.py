@@ -49,7 +49,7 @@ class ViewOptions:
 
 
 @contextmanager
-def writing(file: Path) -> Iterator[None]:
+def naming(file: Path) -> Iterator[None]:
     """What a viewer's library raises while it opens or ends a file is an InputError with its name.
 
     A library says neither the file nor, as ``OSError.errno``, the reason.

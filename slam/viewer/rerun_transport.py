@@ -13,7 +13,7 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import import_extra
 from bmask_slam.semantics.instances.overlay import class_colour
-from bmask_slam.viewer.options import ViewOptions, writing
+from bmask_slam.viewer.options import ViewOptions, naming
 from bmask_slam.viewer.shown import Box, Ellipsoid, Points, SegmentedImage, quaternion
 from bmask_slam.viewer.web_viewer import WebViewer
 
@@ -47,7 +47,7 @@ class RerunTransport:
         self._viewer: WebViewer | None = None
         self._stream = self._rr.RecordingStream(f"bmask-slam {name}")
         if options.record is not None:
-            with writing(options.record):
+            with naming(options.record):
                 self._stream.save(str(options.record))
         elif options.serve:
             import rerun_cli  # noqa: PLC0415 - a part of Rerun
@@ -203,7 +203,7 @@ class RerunTransport:
         if self._viewer is not None:  # first: the stream would wait for one that takes nothing
             self._viewer.close()
         elif self._file is not None:
-            with writing(self._file):
+            with naming(self._file):
                 self._end_file()
         else:
             self._flush()
