@@ -201,8 +201,7 @@ class SlamSystem(SavedSystem):
         if not self.camera.rolling_shutter_s or first is None or self.keyframes.frames_since:
             return tracked
         previous = tracker.motion.previous(tracker.lost_frames)
-        alone = world.in_segment(first.segment) == [first]
-        if previous is None or not alone or not tracked.status.by_image:
+        if previous is None or not world.is_alone(first) or not tracked.status.by_image:
             return tracked
         found = beginning(world, first, previous, tracked, self.camera)
         if found is None:
@@ -245,8 +244,7 @@ class SlamSystem(SavedSystem):
     @stage("semantics")
     def _label(self, frame: Frame, keyframe: Keyframe, static: StaticFeatures) -> None:
         self.moving_objects.store_keyframe(keyframe, static)
-        begins_segment = self.map.world.in_segment(keyframe.segment) == [keyframe]
-        urgent = begins_segment or self.moving_objects.is_crowded(static)
+        urgent = self.map.world.is_alone(keyframe) or self.moving_objects.is_crowded(static)
         self.semantics.observe(frame, keyframe, urgent)
 
     def _join_segments(self, tracked: Tracked) -> Tracked:

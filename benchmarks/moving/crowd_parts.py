@@ -1,29 +1,38 @@
 """Tracking among people: parts of Bonn's crowd, every frame of them or fewer, by default options.
 
-    python -m benchmarks.moving.crowd_parts [--first N ...] [--stride N ...] [--repeats N]
+    python -m benchmarks.moving.crowd_parts [--how NAME ...] [--first N ...] [--stride N ...]
+                                            [--repeats N] [--core N] [--before FOLDER]
 
 Where a recording begins, and how far its frames are apart, decides how much of the first images
 people fill and how far they walk between two frames. Each part is run with several grids of
 keypoints (see benchmarks/moving/no_harm.py): a camera that follows a person is off by decimetres in
-some of them.
+some of them. ``--how``: by `run`, `run --parallel`, `live`, or `live --realtime`. ``--core``: all
+processes on one core. ``--before``: beside other code, as for `benchmarks.live.speed`.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from shutil import copyfile
 from tempfile import TemporaryDirectory
 
+from benchmarks.live.speed import measured
 from benchmarks.moving.no_harm import other_keypoints
 from benchmarks.pages import table
 from benchmarks.paths import SHARED
-from benchmarks.suite.never_lost import Input, outcome
 
 CROWD = SHARED / "bonn_crowd"
 FIRST = (0, 60, 110, 150, 170, 190)
 STRIDES = (2, 3)
+WAYS = {
+    "run": ["run"],
+    "parallel": ["run", "--parallel"],
+    "live": ["live"],
+    "realtime": ["live", "--realtime"],
+}
 
 
 def part_from(first: int, into: Path) -> Path:
@@ -43,31 +52,48 @@ def part_from(first: int, into: Path) -> Path:
     return into
 
 
-def ates_mm(sequence: Path, stride: int, repeats: int) -> list[float]:
-    """The errors of runs by default options, each with another grid of keypoints."""
-    entry = Input(CROWD.name, stride=stride)
-    return [outcome(entry, sequence, [other_keypoints(k)]).ate_mm for k in range(repeats)]
+def parts(given: argparse.Namespace, folder: Path) -> Iterator[tuple[str, Path, list[str]]]:
+    """Name, folder and options of each part; ``run`` alone leaves frames out."""
+    for first in given.first:
+        yield f"from frame {first}", part_from(first, folder / f"bonn_crowd_{first}"), []
+    for stride in given.stride:
+        if set(given.how) <= {"run", "parallel"}:
+            yield f"every frame number {stride}", CROWD, ["--stride", str(stride)]
 
 
-def _row(name: str, errors_mm: Sequence[float]) -> tuple[str, str]:
-    return name, ", ".join(f"{error:.1f}" for error in errors_mm)
+def ates_mm(command: Sequence[str], repeats: int, code: Path | None) -> Iterator[float]:
+    """The errors of a command's runs, each with another grid of keypoints."""
+    with TemporaryDirectory() as folder:
+        for k in range(repeats):
+            options = [*command, "--set", other_keypoints(k)]
+            yield 1e3 * measured(options, Path(folder) / "run", code)["ate_rmse"]
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--how", nargs="*", choices=list(WAYS), default=["run"])
     parser.add_argument("--first", type=int, nargs="*", default=FIRST, metavar="N")
     parser.add_argument("--stride", type=int, nargs="*", default=STRIDES, metavar="N")
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--core", type=int)
+    parser.add_argument("--before", type=Path, metavar="FOLDER")
     given = parser.parse_args()
+    if given.core is not None:
+        os.sched_setaffinity(0, {given.core})
+    codes = {"": None} if given.before is None else {", before": given.before, "": None}
+    columns = [
+        (f"{way}{when}", WAYS[way], code) for way in given.how for when, code in codes.items()
+    ]
     rows = []
     with TemporaryDirectory() as folder:
-        for first in given.first:
-            part = part_from(first, Path(folder) / f"bonn_crowd_{first}")
-            rows.append(_row(f"from frame {first}", ates_mm(part, 1, given.repeats)))
-    for stride in given.stride:
-        rows.append(_row(f"every frame number {stride}", ates_mm(CROWD, stride, given.repeats)))
-    print(table(("Bonn crowd", "ATE mm"), rows))
+        for name, part, options in parts(given, Path(folder)):
+            errors = (
+                ates_mm([way[0], str(part), *way[1:], *options], given.repeats, code)
+                for _, way, code in columns
+            )
+            rows.append((name, *(", ".join(f"{mm:.1f}" for mm in found) for found in errors)))
+    print(table(("Bonn crowd, ATE mm", *(title for title, *_ in columns)), rows))
 
 
 if __name__ == "__main__":

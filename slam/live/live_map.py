@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -60,10 +61,28 @@ class LiveMap(SensorInput):
     def catch_up(self, waiting: float = math.inf) -> None:
         """Apply the other processes' results; wait until at most ``waiting`` keyframes are pending.
 
-        The wait ends after ``MAX_MAP_WAIT_S``, unless the camera is being estimated, for at
-        most ``remote_calibration.WAIT_S``.
+        With a finite ``waiting`` it also waits for masks that are urgent, and while the dense map
+        would drop a keyframe. The wait ends after ``MAX_MAP_WAIT_S``, unless the camera is being
+        estimated, for at most ``remote_calibration.WAIT_S``.
         """
-        self._system.wait_for_map(waiting, MAX_MAP_WAIT_S)
+        deadline_s = time.monotonic() + MAX_MAP_WAIT_S
+        self._system.catch_up()
+        while self._is_estimating(waiting) or (
+            self._is_behind(waiting) and time.monotonic() < deadline_s
+        ):
+            time.sleep(0.001)
+            self._system.catch_up()
+
+    def _is_estimating(self, waiting: float) -> bool:
+        found = self._system.calibration
+        return found is not None and waiting < math.inf and found.is_awaited
+
+    def _is_behind(self, waiting: float) -> bool:
+        system = self._system
+        is_full = system.dense is not None and system.dense.full
+        is_urgent = system.segmenter is not None and bool(system.segmenter.urgent)
+        others = waiting < math.inf and (is_full or is_urgent)
+        return others or (system.remote.pending > waiting and not system.remote.given_up)
 
     def processes(self) -> dict[str, int]:
         """Process ids by name; that of the calibration until the camera is settled."""

@@ -160,7 +160,8 @@ class LiveSlam(LiveMap):
     ) -> FrameResult:
         """Track a frame: its pose ``T_world_camera`` (4, 4), status and covariance.
 
-        The time that it takes is bounded: it does not wait for the other processes.
+        The time that it takes is bounded: it does not wait for the other processes, but up to
+        ``segmentation.BEGINNING_S`` for the masks of a frame that has begun a map.
 
         Args:
             timestamp_s: of the frame; later than the one before. Where the source's clock goes

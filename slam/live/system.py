@@ -9,8 +9,6 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.calibration.keyframe_motions import motions_without_images
 from bmask_slam.features.brisk import Features
@@ -25,7 +23,7 @@ from bmask_slam.live.messages import STATE_FILE, ChangeOwnFactors, ImageToSegmen
 from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.processes.remote_calibration import RemoteCalibration
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
-from bmask_slam.live.processes.segmentation import RemoteSegmenter
+from bmask_slam.live.processes.segmentation import BEGINNING_S, RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.moving.covered_parts import CoveredWatch, with_verdict
 from bmask_slam.runtime.memory import short_pauses
@@ -94,8 +92,15 @@ class LiveSystem(SlamSystem):
             self._resources = undo.pop_all()
 
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
-        """Apply the other processes' results, then do the same step as offline."""
+        """Apply the other processes' results, then do the same step as offline.
+
+        The second frame of a map segment waits for the masks of the first, up to ``BEGINNING_S``:
+        it has no other landmarks, and a camera before a person would follow that person.
+        """
         self.catch_up()
+        while self.segmenter is not None and self.segmenter.waits_for_masks():
+            time.sleep(0.001)
+            self.catch_up()
         found = self.calibration
         if found is not None and self.remote.extends and found.begins_anew(frame, self.camera):
             self.events.calibration("the map so far is bent by depth's delay and begins anew")
@@ -145,6 +150,8 @@ class LiveSystem(SlamSystem):
         T_before = None if reference is None else reference.T_world_camera
         for masks in self.remote.catch_up():
             self.moving_objects.observe_masks(masks)
+            if self.segmenter is not None:
+                self.segmenter.urgent.pop(masks.keyframe_id, None)
         for found in self.segmenter.receive_masks() if self.segmenter else ():
             self.remote.send(found)
             for listener in self.mask_listeners:
@@ -195,28 +202,6 @@ class LiveSystem(SlamSystem):
         dense.place(remote.world, remote.history, moved)
         lacks = segmenter.awaits if segmenter is not None else (lambda number: False)
         dense.update(remote.world, remote.awaits, lacks)
-
-    def wait_for_map(self, waiting: float, timeout_s: float) -> None:
-        """Catch up until at most ``waiting`` keyframes wait for the map, or until the timeout.
-
-        With a finite ``waiting`` it also waits while the dense map would drop a keyframe, and,
-        however long the timeout, for an estimate of the camera (`RemoteCalibration.is_awaited`).
-        """
-        deadline_s = time.monotonic() + timeout_s
-        self.catch_up()
-        while self._is_estimating(waiting) or (
-            self._is_behind(waiting) and time.monotonic() < deadline_s
-        ):
-            time.sleep(0.001)
-            self.catch_up()
-
-    def _is_estimating(self, waiting: float) -> bool:
-        found = self.calibration
-        return found is not None and waiting < np.inf and found.is_awaited
-
-    def _is_behind(self, waiting: float) -> bool:
-        is_full = waiting < np.inf and self.dense is not None and self.dense.full
-        return is_full or (self.remote.pending > waiting and not self.remote.given_up)
 
     def insert(self, frame: Frame, tracked: Tracked, local_ids: Ints) -> tuple[Tracked, Keyframe]:
         """Make a frame a keyframe; the map's process joins segments."""
@@ -288,8 +273,12 @@ class _RemoteSemantics(SemanticMapper):
 
     def observe(self, frame: Frame, keyframe: Keyframe, urgent: bool = False) -> None:
         """Send the requests; does not wait for answers."""
-        if self._system.segmenter is not None:
-            self._system.segmenter.request(ImageToSegment(keyframe.id, frame.rgb, frame.name))
+        segmenter = self._system.segmenter
+        if segmenter is not None:
+            segmenter.request(ImageToSegment(keyframe.id, frame.rgb, frame.name))
+            if urgent:
+                begins = self._system.map.world.is_alone(keyframe)
+                segmenter.hurry(keyframe.id, BEGINNING_S if begins else 0.0)
         if self._system.dense is not None:
             self._system.dense.add_keyframe(keyframe.id, frame)
 

@@ -69,11 +69,10 @@ class LockstepMapper(RemoteMapper):
         """What was sent since the last call belongs to this frame."""
         self._ends.append(self.worker.sent)
 
-    def use_all(self) -> None:
-        """Wait for all answers and use them; other messages are kept for ``catch_up``."""
+    def all_due(self) -> None:
+        """Answers to all that was sent are due."""
         self._due = self.worker.sent
         self._ends.clear()
-        self._kept = self.catch_up()
 
     def catch_up(self, timeout_s: float = 0.0) -> list[Any]:
         """Apply the answers that are due, once they have come; returns the other messages.
@@ -116,7 +115,8 @@ class LockstepMapper(RemoteMapper):
         """
         saves = self.worker.saves
         self.send(SaveState(path))
-        self.use_all()
+        self.all_due()
+        self._kept = self.catch_up()
         if self.worker.saves == saves:
             raise InputError(f"{path}: the map's process could not write its state")
 
@@ -159,6 +159,7 @@ class LockstepSegmenter(RemoteSegmenter):
     def begin(self) -> None:
         """The run begins, or begins anew."""
         self._frame = 0
+        self.urgent = {}
         self._images: deque[tuple[int, ImageToSegment]] = deque()  # of which masks will be used
         self._found: dict[int, Masks] = {}
 

@@ -26,7 +26,6 @@ from bmask_slam.semantics.segmenters.segmenter_table import (
     needed_by,
 )
 from bmask_slam.semantics.segmenters.upright import Upright
-from bmask_slam.semantics.tracks.instance_track import load_filters
 
 ANSWER_S = 600.0
 """Longest time for an image: a large network on an old processor takes a minute."""
@@ -60,7 +59,6 @@ class SegmenterBeside(RemoteSegmenter):
         self._reasons: dict[int, str] = {}
 
     def _known_labels(self, options: SegmenterOptions, sequence: Path) -> LabelSet:
-        load_filters()  # while the process loads its network
         if options.is_shipped and 0 <= options.min_score <= 1:
             return labels_of(options, sequence)
         return super()._known_labels(options, sequence)

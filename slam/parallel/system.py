@@ -52,6 +52,8 @@ class ParallelSystem(LiveSystem):
         self.remote.begin_frame()
         if self.segmenter is not None:
             self.segmenter.begin_frame()
+            if self.segmenter.urgent:
+                self._use_all()
         result = super().process(frame, features)
         self.remote.end_frame()
         return result
@@ -116,13 +118,17 @@ class ParallelSystem(LiveSystem):
 
     def _settle(self) -> None:
         """Use all that is still to come of the other processes."""
+        self.remote.send_frames()
+        self._use_all()
+
+    def _use_all(self) -> None:
+        """Use all that the other processes make of what they were sent."""
         if self.segmenter is not None:
             self.segmenter.use_all()
-        self.remote.send_frames()
         sent = -1
         while sent != self.remote.worker.sent:
             sent = self.remote.worker.sent
-            self.remote.use_all()
+            self.remote.all_due()
             self.catch_up()
 
     def finish(self) -> None:

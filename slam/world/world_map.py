@@ -98,6 +98,10 @@ class WorldMap:
         """The keyframes of one map segment, oldest first."""
         return [k for k in self.keyframes.values() if k.segment == segment]
 
+    def is_alone(self, keyframe: Keyframe) -> bool:
+        """Whether a keyframe is the only one of its map segment."""
+        return self.in_segment(keyframe.segment) == [keyframe]
+
     def largest_segment(self) -> int:
         """The mapped segment with most keyframes, any if none is; the older of equal ones."""
         counts, mapped = Counter(k.segment for k in self.keyframes.values()), self.mapped_segments()
@@ -257,8 +261,7 @@ class WorldMap:
         apart = landmarks.patch_distances(ids, views, config.limits)
         unlike = np.flatnonzero(apart.min(axis=1) > 1)
         patches = cut_patches(features.gray, features.image_pixels[rows[unlike]])
-        slots = apart[unlike].argmax(axis=1)
-        landmarks.put_patches(ids[unlike], slots, patches, views[unlike])
+        landmarks.put_patches(ids[unlike], apart[unlike].argmax(axis=1), patches, views[unlike])
 
     def covisible(self, landmark_ids: Ints, minimum: int) -> list[tuple[int, Keyframe]]:
         """(shared landmarks, keyframe) of all that share at least a minimum, by falling number.
@@ -268,14 +271,12 @@ class WorldMap:
         shared = np.bincount(self._observers.of(np.unique(landmark_ids)))
         strong = np.flatnonzero(shared >= minimum)[::-1]
         strong = strong[np.argsort(-shared[strong], kind="stable")]
-        counts = shared[strong].tolist()
-        return [(n, self.keyframes[k]) for n, k in zip(counts, strong.tolist(), strict=True)]
+        return [(int(shared[k]), self.keyframes[k]) for k in strong.tolist()]
 
     def replace_landmarks(self, old_ids: Ints, new_ids: Ints) -> Ints:
         """Fuse duplicates: every observation of old_ids[k] becomes one of new_ids[k].
 
-        Returns the ids that were removed. A keyframe that observes both keeps the new one's
-        keypoint, since one landmark has one place in an image.
+        Returns the ids removed. A keyframe that observes both keeps the new one's keypoint.
         """
         old, new = ends_of_chains(old_ids, new_ids)
         new_ids = new[np.searchsorted(old, old_ids)]
@@ -288,9 +289,8 @@ class WorldMap:
             occupied = present[targets]
             present[keyframe.landmark_ids] = False
             _, first = np.unique(targets, return_index=True)
-            repeated = np.ones(len(targets), bool)
-            repeated[first] = False
-            keep = ~(occupied | repeated)
+            keep = np.zeros(len(targets), bool)
+            keep[first] = ~occupied[first]
             self.observe(keyframe, rows[~keep], -1)
             self.attach(keyframe, rows[keep], targets[keep])
         np.add.at(self.landmarks.found, new_ids, self.landmarks.found[old_ids])

@@ -22,6 +22,7 @@ from bmask_slam.semantics.segmenters.segmenter_table import (
     make_segmenter,
 )
 from bmask_slam.semantics.segmenters.upright import Upright
+from bmask_slam.semantics.tracks.instance_track import load_filters
 
 logger = logging.getLogger(__name__)
 
@@ -29,6 +30,8 @@ MAX_WAITING = 4
 """Largest number of keyframes that wait for segmentation; the oldest are skipped."""
 MAX_KEPT = 100
 """The same for a workstation, which may go away and catches up when it is back."""
+BEGINNING_S = 0.5
+"""Longest wait of tracking for the masks of a keyframe that begins a map segment."""
 MAX_IMAGE_CRASHES = 2
 """An image at which so many processes have died is left out."""
 
@@ -78,6 +81,7 @@ class RemoteSegmenter:
         labels: classes of the segmenter.
         dropped: number of keyframes that were skipped.
         segmentation_ms: time of each keyframe that was segmented.
+        urgent: keyframes whose masks are waited for, and until when (monotonic, seconds).
         worker: the supervised process.
     """
 
@@ -100,6 +104,7 @@ class RemoteSegmenter:
         """
         self.dropped = 0
         self.segmentation_ms: list[float] = []
+        self.urgent: dict[int, float] = {}
         self._requested: dict[int, ImageToSegment] = {}
         self._working = -1  # the last image that the process has begun with
         self._crashes_at: Counter[int] = Counter()
@@ -111,6 +116,7 @@ class RemoteSegmenter:
         else:
             target = f"{__name__}:serve_segmenter"
             self.worker = SupervisedWorker(name, target, arguments, policy or RestartPolicy())
+        load_filters()  # while the process loads its network
         try:
             self.labels = self._known_labels(options, sequence)
         except InputError:
@@ -142,6 +148,20 @@ class RemoteSegmenter:
             del self._requested[next(iter(self._requested))]
             self.dropped += 1
         self.worker.send(image, begins)
+
+    def hurry(self, keyframe_id: int, wait_s: float) -> None:
+        """Let tracking wait so long for the masks of a keyframe, unless the workstation is away.
+
+        A source that can wait does so longer (`LiveMap.catch_up`), also where this is 0.
+        """
+        if not self.worker.is_away:
+            self.urgent[keyframe_id] = time.monotonic() + wait_s
+
+    def waits_for_masks(self) -> bool:
+        """Whether tracking still waits for masks; those whose time is over are urgent no more."""
+        now_s = time.monotonic()
+        self.urgent = {number: end_s for number, end_s in self.urgent.items() if now_s < end_s}
+        return bool(self.urgent)
 
     def receive_masks(self) -> list[Masks]:
         """The masks that have come. A process that died or hangs is restarted."""
@@ -176,9 +196,11 @@ class RemoteSegmenter:
             self.worker.send(image)
         if self.worker.given_up:
             self._requested.clear()
+            self.urgent.clear()
 
     def _leave_out(self, message: NotSegmented) -> None:
         self._requested.pop(message.keyframe_id, None)
+        self.urgent.pop(message.keyframe_id, None)
         self._not_segmented(message)
 
     def _refuse_masks(self) -> None:

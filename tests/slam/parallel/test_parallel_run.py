@@ -130,6 +130,22 @@ def test_a_map_of_another_run_is_refused(slow_office: Path, whole: Path) -> None
         options(slow_office, whole, map=whole)
 
 
+def test_masks_of_the_first_keyframe_are_used_before_the_next_frame(
+    slow_office: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    awaited: dict[int, list[bool]] = {}
+
+    def look(system: ParallelSystem, index: int) -> None:
+        assert system.segmenter is not None
+        awaited[index] = [system.segmenter.awaits(k) for k in system.map.world.keyframes]
+
+    with_each_frame(monkeypatch, look)
+    run(options(slow_office, tmp_path / "run", "truth"))
+    assert awaited[1] == [True]
+    assert awaited[2][0] is False
+    assert any(any(others[1:]) for others in awaited.values())  # later ones have time
+
+
 class SlowWorker(SimpleNamespace):
     """A segmenter's process whose masks have come when they were asked for three times."""
 
