@@ -1,8 +1,8 @@
 """The other processes' answers, each used at a frame that does not depend on how fast they are.
 
 What tracking sends with a frame is answered before the frame that is ``LAG`` later, and not used
-earlier, however soon it comes. So tracking, map and masks work at the same time, and a run that is
-repeated gives the same bytes.
+earlier, however soon it comes; where masks are urgent, all is answered before the next frame. So
+tracking, map and masks work at the same time, and a run that is repeated gives the same bytes.
 """
 
 from __future__ import annotations
