@@ -82,6 +82,22 @@ def _children_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
+def repeats_of(
+    parser: argparse.ArgumentParser,
+) -> tuple[argparse.Namespace, dict[str, Path | None]]:
+    """The arguments, with ``--repeats`` and ``--core``, on which all runs are then, and the codes.
+
+    These by what is put behind a name: that of ``--before``, if given, and this one, which is None.
+    """
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--core", type=int)
+    parser.add_argument("--before", type=Path, metavar="FOLDER")
+    given = parser.parse_args()
+    if given.core is not None:
+        os.sched_setaffinity(0, {given.core})
+    return given, {"": None} if given.before is None else {", before": given.before, "": None}
+
+
 def variants_of(
     common: list[str], segmenter: str, before: Path | None
 ) -> dict[str, tuple[list[str], Path | None]]:

@@ -11,12 +11,11 @@ processes on one core. ``--before``: beside other code, as for `benchmarks.live.
 from __future__ import annotations
 
 import argparse
-import os
 import tempfile
 from pathlib import Path
 
 from benchmarks.cameras.mirrored import CHANGES, write_changed
-from benchmarks.live.speed import measured
+from benchmarks.live.speed import measured, repeats_of
 from benchmarks.paths import SHARED
 from bmask_slam.run_folder.reader import Run
 
@@ -53,13 +52,7 @@ def main() -> None:
     """Print a line for each recording."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("sequences", type=Path, nargs="*", default=[SHARED / "tum_fr1_rpy"])
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--core", type=int)
-    parser.add_argument("--before", type=Path, metavar="FOLDER")
-    given = parser.parse_args()
-    if given.core is not None:
-        os.sched_setaffinity(0, {given.core})
-    codes = {"": None} if given.before is None else {", before": given.before, "": None}
+    given, codes = repeats_of(parser)
     print(f"{'':{NAME}}{'lost':>14}{'dropped':>14}{'ATE mm':>20}")
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)

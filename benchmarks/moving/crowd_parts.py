@@ -13,13 +13,12 @@ processes on one core. ``--before``: beside other code, as for `benchmarks.live.
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from shutil import copyfile
 from tempfile import TemporaryDirectory
 
-from benchmarks.live.speed import measured
+from benchmarks.live.speed import measured, repeats_of
 from benchmarks.moving.no_harm import other_keypoints
 from benchmarks.pages import table
 from benchmarks.paths import SHARED
@@ -75,13 +74,7 @@ def main() -> None:
     parser.add_argument("--how", nargs="*", choices=list(WAYS), default=["run"])
     parser.add_argument("--first", type=int, nargs="*", default=FIRST, metavar="N")
     parser.add_argument("--stride", type=int, nargs="*", default=STRIDES, metavar="N")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--core", type=int)
-    parser.add_argument("--before", type=Path, metavar="FOLDER")
-    given = parser.parse_args()
-    if given.core is not None:
-        os.sched_setaffinity(0, {given.core})
-    codes = {"": None} if given.before is None else {", before": given.before, "": None}
+    given, codes = repeats_of(parser)
     columns = [
         (f"{way}{when}", WAYS[way], code) for way in given.how for when, code in codes.items()
     ]
