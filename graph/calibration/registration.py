@@ -25,6 +25,8 @@ DELAYS_S = np.arange(-0.12, 0.1201, 0.008)
 SMOOTH = 1.0
 """Steps by which maps are smoothed, so that the largest place is that of a peak, not of noise."""
 BOOTSTRAPS, SEED = 60, 0
+_TOGETHER = 12
+"""Draws that are summed at once; all of them would take 60 MB."""
 MAD_SIGMA = 1.4826
 
 
@@ -79,8 +81,8 @@ def register(edges: EdgeScores) -> Registration | None:
         return None
     stacks = np.array([_along_delays(edges, i) for i in range(count)])
     draws = np.random.default_rng(SEED).multinomial(count, np.full(count, 1 / count), BOOTSTRAPS)
-    drawn = np.tensordot(draws.astype(float), stacks, 1)
-    found = np.array([_peak(stack)[:3] for stack in drawn])
+    parts = np.split(draws.astype(float), BOOTSTRAPS // _TOGETHER)
+    found = np.array([_peak(s)[:3] for part in parts for s in np.tensordot(part, stacks, 1)])
     delay_s, *shift_steps, strength = _peak(stacks.sum(axis=0))
     sigmas = found.std(axis=0, ddof=1)
     step = edges.step_px

@@ -47,10 +47,11 @@ class Ring:
         """Copy bytes in; returns their position, for ``read``, or None if there is no room."""
         size, capacity = data.nbytes, len(self._bytes)
         begin = -(-self._written // _ALIGNMENT) * _ALIGNMENT
-        if begin % capacity + size > capacity:  # not over the end
-            begin = -(-begin // capacity) * capacity
         read = int(self._position[0])
-        oldest = begin if read >= self._written else read
+        is_empty = read >= self._written
+        if is_empty or begin % capacity + size > capacity:  # few pages are used; not over the end
+            begin = -(-begin // capacity) * capacity
+        oldest = begin if is_empty else read
         if begin + size - oldest > capacity:
             return None
         place = begin % capacity
