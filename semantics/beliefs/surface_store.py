@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
 from bmask_slam.graph.files.array_file import check_ids
+from bmask_slam.semantics.beliefs.id_tables import IdTables
 from bmask_slam.semantics.beliefs.label_fusion import in_turn
 from bmask_slam.semantics.labels import LabelSet, label_set
 
@@ -80,13 +83,13 @@ class SurfaceEstimates:
         return cls(names, np.where(best < MIN_PROBABILITY, 0, labels), best)
 
 
-class SurfaceStore:
+class SurfaceStore(IdTables):
     """A distribution over the classes of surfaces for every id >= 0, and its number of views."""
 
+    TABLES: ClassVar = ("_log_sums", "_views")
+
     def __init__(self) -> None:
-        self.names = label_set(())
-        self._log_sums = np.zeros((0, 0), np.float32)
-        self._views = np.zeros(0, np.int32)
+        self._begin(label_set(()))
 
     def update(self, names: LabelSet, ids: Ints, probabilities: Floats) -> None:
         """Add views of ids (N,), which may repeat, with distributions (N, C).
@@ -94,69 +97,59 @@ class SurfaceStore:
         Views with another label set than the first ones' are not used.
         """
         if len(self.names) == 1:
-            self.names = names
-            self._log_sums = np.zeros((0, len(names) - 1), np.float32)
+            self._begin(names)
         if names != self.names or not len(ids):
             return
-        self._reserve(int(ids.max()) + 1)
-        gained = log_view(probabilities)
-        for rows in in_turn(ids):
-            self._log_sums[ids[rows]] += gained[rows]
-        np.add.at(self._views, ids, 1)
+        at, gained = self._rows(ids), log_view(probabilities)
+        for part in in_turn(at):
+            self._log_sums[at[part]] += gained[part]
+        np.add.at(self._views, at, 1)
 
     def move(self, from_ids: Ints, to_ids: Ints) -> None:
         """Add all views of from_ids (N,) to those of to_ids (N,): each pair is one thing."""
-        inside = from_ids < len(self._views)
-        from_ids, to_ids = from_ids[inside], to_ids[inside]
-        if not len(from_ids):
-            return
-        self._reserve(int(to_ids.max()) + 1)
-        sums, views = self._log_sums[from_ids], self._views[from_ids]
-        self.drop(from_ids)
-        np.add.at(self._log_sums, to_ids, sums)
-        np.add.at(self._views, to_ids, views)
+        known, rows = self._found(from_ids)
+        sums, views = self._log_sums[rows], self._views[rows]
+        self._remove(from_ids)
+        to = self._rows(to_ids[known])
+        np.add.at(self._log_sums, to, sums)
+        np.add.at(self._views, to, views)
 
     def drop(self, ids: Ints) -> None:
         """Forget ids (N,)."""
-        ids = ids[ids < len(self._views)]
-        self._log_sums[ids] = 0
-        self._views[ids] = 0
+        self._remove(ids)
 
     def known(self) -> Ints:
         """Ids (N,) that had a view, ascending."""
-        return np.flatnonzero(self._views)
+        return self._ids
 
     def probabilities(self, ids: Ints) -> Array:
         """Distributions (N, C) of any ids (N,); uniform where there was no view."""
         sums, views = np.zeros((len(ids), len(self.names) - 1)), np.zeros(len(ids))
-        inside = ids < len(self._views)
-        sums[inside], views[inside] = self._log_sums[ids[inside]], self._views[ids[inside]]
+        inside, rows = self._found(ids)
+        sums[inside], views[inside] = self._log_sums[rows], self._views[rows]
         return pooled(sums, views)
 
     def state(self) -> Arrays:
         """The store as named arrays with one row for each id that had a view."""
-        ids = self.known()
         return {
             "names": np.array(self.names.names),
-            "ids": ids,
-            "log_sums": self._log_sums[ids].ravel(),
-            "views": self._views[ids],
+            "ids": self._ids,
+            "log_sums": self._log_sums.ravel(),
+            "views": self._views,
         }
 
     def restore(self, state: Arrays) -> None:
         """Replace the content by a state."""
         ids = state["ids"]
         check_ids(ids, int(ids.max(initial=-1)) + 1)
-        self.names = LabelSet(tuple(state["names"].tolist()))
-        self._log_sums = np.zeros((0, len(self.names) - 1), np.float32)
-        self._views = np.zeros(0, np.int32)
-        self._reserve(int(ids.max(initial=-1)) + 1)
-        self._log_sums[ids] = state["log_sums"].reshape(len(ids), len(self.names) - 1)
-        self._views[ids] = state["views"]
+        self._begin(LabelSet(tuple(state["names"].tolist())))
+        rows = self._rows(ids)
+        self._log_sums[rows] = state["log_sums"].reshape(len(ids), len(self.names) - 1)
+        self._views[rows] = state["views"]
 
-    def _reserve(self, size: int) -> None:
-        """Make room for ids below ``size``: the next power of two of rows."""
-        if size > len(self._views):
-            more = (1 << max(size - 1, 1023).bit_length()) - len(self._views)
-            self._log_sums = np.pad(self._log_sums, ((0, more), (0, 0)))
-            self._views = np.pad(self._views, (0, more))
+    def _begin(self, names: LabelSet) -> None:
+        """Begin with an empty store of the classes of a label set."""
+        super().__init__()
+        self.names = names
+        self._log_sums: Floats = np.zeros((0, len(names) - 1), np.float32)
+        self._views: NDArray[np.int32] = np.zeros(0, np.int32)

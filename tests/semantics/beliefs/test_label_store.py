@@ -8,7 +8,8 @@ import pytest
 from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.observation import GROUPS, observation_model
-from bmask_slam.semantics.labels import read_label_set
+from bmask_slam.semantics.beliefs.surface_store import SurfaceStore
+from bmask_slam.semantics.labels import label_set, read_label_set
 
 C = 5
 PRIOR = np.array([0.5, *4 * [0.125]])
@@ -211,6 +212,22 @@ def test_an_id_beyond_the_capacity_is_moved_to_a_smaller_id_and_back() -> None:
     assert np.array_equal(store.probabilities(ids), whole.probabilities(ids))
     store.move(np.array([3000]), np.array([9000]))
     assert store.known().tolist() == [9000]
+
+
+def test_a_store_has_rows_for_what_is_known_alone() -> None:
+    """Ids are never used twice, and most landmarks of a long session are removed."""
+    rng, names = np.random.default_rng(8), label_set(("wall", "floor"))
+    store, surfaces = LabelStore(C), SurfaceStore()
+    for first in range(0, 10**9, 10**8):
+        ids = first + np.arange(50)
+        store.update(ids, *views(50, rng))
+        surfaces.update(names, ids, rng.dirichlet(np.ones(2), 50).astype(np.float32))
+        for each in (store, surfaces):
+            each.move(ids[:10], ids[10:20])
+            each.drop(ids[20:])
+            assert each.known().tolist()[-10:] == ids[10:20].tolist()
+    tables = [*vars(store).values(), *vars(surfaces).values()]
+    assert max(len(t) for t in tables if isinstance(t, np.ndarray)) == 100
 
 
 @pytest.mark.parametrize("measured", ["", "light"])
