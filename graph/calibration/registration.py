@@ -25,8 +25,6 @@ DELAYS_S = np.arange(-0.12, 0.1201, 0.008)
 SMOOTH = 1.0
 """Steps by which maps are smoothed, so that the largest place is that of a peak, not of noise."""
 BOOTSTRAPS, SEED = 60, 0
-_TOGETHER = 12
-"""Draws that are summed at once; all of them would take 60 MB."""
 MAD_SIGMA = 1.4826
 
 
@@ -79,11 +77,10 @@ def register(edges: EdgeScores) -> Registration | None:
     count = len(edges.scores)
     if count < MIN_FRAMES:
         return None
-    stacks = np.array([_along_delays(edges, i) for i in range(count)])
     draws = np.random.default_rng(SEED).multinomial(count, np.full(count, 1 / count), BOOTSTRAPS)
-    parts = np.split(draws.astype(float), BOOTSTRAPS // _TOGETHER)
-    found = np.array([_peak(s)[:3] for part in parts for s in np.tensordot(part, stacks, 1)])
-    delay_s, *shift_steps, strength = _peak(stacks.sum(axis=0))
+    weights = np.concatenate([np.ones((1, count)), draws])
+    (delay_s, *shift_steps, strength), *others = _peaks(edges, weights)
+    found = np.array([peak[:3] for peak in others])
     sigmas = found.std(axis=0, ddof=1)
     step = edges.step_px
     return Registration(
@@ -103,23 +100,36 @@ def _strength(smooth: Array) -> float:
     return float((smooth.max() - middle) / max(spread, 1e-12))
 
 
-def _along_delays(edges: EdgeScores, i: int) -> Array:
-    """The map of a frame, smoothed, moved by its flow for each of DELAYS_S (T, S, S)."""
-    smooth = gaussian_filter(edges.scores[i], SMOOTH)
-    by_second = edges.flow_px_s[i, ::-1] / edges.step_px
-    moves = (edges.lags_s[i] + DELAYS_S)[:, None] * by_second
-    return np.array([shift(smooth, move, order=1, mode="nearest") for move in moves])
+def _peaks(edges: EdgeScores, weights: Array) -> list[tuple[float, float, float, float]]:
+    """Of each sum of the frames' maps by weights (D, n), each map moved by its flow for a delay:
+    delay in s, shift along u and v in steps, and strength, of the highest value.
+
+    One delay after another, since the maps of all would take 100 MB.
+    """
+    smooth = [gaussian_filter(scores, SMOOTH) for scores in edges.scores]
+    by_second = edges.flow_px_s[:, ::-1] / edges.step_px
+    by_delay = np.zeros((len(DELAYS_S), len(weights)))
+    best = np.zeros((len(weights), *edges.scores.shape[1:]))
+    for k, delay_s in enumerate(DELAYS_S):
+        moves = (edges.lags_s + delay_s)[:, None] * by_second
+        pairs = zip(smooth, moves, strict=True)
+        moved = np.array([shift(one, move, order=1, mode="nearest") for one, move in pairs])
+        sums = np.tensordot(weights, moved, 1)
+        by_delay[k] = sums.max(axis=(1, 2))
+        higher = by_delay[k] > by_delay[:k].max(axis=0, initial=-np.inf)
+        best[higher] = sums[higher]
+    return [_peak(*each) for each in zip(by_delay.T, best, strict=True)]
 
 
-def _peak(stack: Array) -> tuple[float, float, float, float]:
-    """Delay in s, shift along u and v in steps, and strength, of the highest value of (T, S, S)."""
-    t, v, u = np.unravel_index(int(stack.argmax()), stack.shape)
-    radius = stack.shape[1] // 2
-    by_delay = stack.max(axis=(1, 2))
-    delay_s = float(np.interp(t + _parabola(by_delay, int(t)), range(len(DELAYS_S)), DELAYS_S))
-    at_u = u + _parabola(stack[t, v], int(u)) - radius
-    at_v = v + _parabola(stack[t, :, u], int(v)) - radius
-    return delay_s, float(at_u), float(at_v), _strength(stack[t])
+def _peak(by_delay: Array, best: Array) -> tuple[float, float, float, float]:
+    """The same of the highest values (T,) by delay and the map (S, S) of the highest of these."""
+    t = int(by_delay.argmax())
+    v, u = np.unravel_index(int(best.argmax()), best.shape)
+    radius = len(best) // 2
+    delay_s = float(np.interp(t + _parabola(by_delay, t), range(len(DELAYS_S)), DELAYS_S))
+    at_u = u + _parabola(best[v], int(u)) - radius
+    at_v = v + _parabola(best[:, u], int(v)) - radius
+    return delay_s, float(at_u), float(at_v), _strength(best)
 
 
 def _parabola(values: Array, i: int) -> float:
