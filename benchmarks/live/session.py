@@ -1,6 +1,6 @@
 """A long session of the live loop: latency and memory over time.
 
-    python -m benchmarks.live.session SEQUENCE [--minutes 30] [--hz 30]
+    python -m benchmarks.live.session SEQUENCE [--minutes 30] [--hz 30] [--segmenter none]
 
 A rendered sequence is played forward and backward with the stamps of a camera of that rate, without
 pauses. Memory is that of each process's own (anonymous) pages, at the end of each
@@ -78,10 +78,11 @@ def main() -> None:
     parser.add_argument("sequence", type=Path)
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--hz", type=float, default=30.0)
+    parser.add_argument("--segmenter", default="none")
     arguments = parser.parse_args()
     sequence = open_sequence(arguments.sequence)
     frames = int(60 * arguments.minutes * arguments.hz)
-    config = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
+    config = resolve(SystemConfig, None, (f"semantics.segmenter.name={arguments.segmenter}",))
     part = frames // PARTS
     rows: list[tuple[Health, float, float, list[float]]] = []
     number = count(1)
