@@ -110,7 +110,7 @@ class LoopNoise:
 
     Short cycles hardly contain errors of the map, so their mean chi-square over its expectation is
     the ratio of the loops' real covariance to the stated one. That it is one number was measured:
-    it depends neither on the loops' motion nor on their inliers (docs/results/graph.md).
+    it depends neither on the loops' motion nor on their inliers (docs/graph.md).
     """
 
     def __init__(self, config: NoiseConfig):
