@@ -88,10 +88,13 @@ REPORTS = {
             "A day of a robot, by descriptors and poses",
             "scale.day --picture docs/images/day.png",
         ),
+        "revisits": (
+            "A real room seen again and again", "loops.revisits ../shared/data/redkitchen"
+        ),
         "far": ("At 100 km, on paper", ""),
     }, pictures={
         "day": {"day.png": "Times, memory and file, keyframes and loops over the day"},
-    }),
+    }, markdown=frozenset({"revisits"})),
     "live": Report(RESULTS / "live.md", "Results: the live loop", {
         "speed": ("Red kitchen, offline and live", "live.speed --repeats 1"),
         "session": (
