@@ -110,7 +110,10 @@ def _frame(axes: Axes, shown: Sequence[Array]) -> None:
 def _write_names(
     axes: Axes, ordered: Sequence[MapObject], corners: Sequence[Array], found: MapObjects
 ) -> None:
-    """Write the names at their objects, moved up or down where they would cover each other."""
+    """Write the names at their objects, moved up or down where they would cover each other.
+
+    Names stay below the title and in the picture.
+    """
     low_m, high_m = axes.get_ylim()
     line_m = LINE_M * (high_m - low_m)
     taken: list[tuple[float, float, float]] = []
@@ -120,7 +123,10 @@ def _write_names(
         half_m = 0.25 * line_m * len(name)
         for step in (0, 1, -1, 2, -2, 3, -3):
             free = y_m + step * line_m
-            if all(abs(free - y) >= line_m or abs(x_m - x) >= half_m + h for x, y, h in taken):
+            inside = not step or low_m + line_m / 2 < free < high_m - line_m / 2
+            if inside and all(
+                abs(free - y) >= line_m or abs(x_m - x) >= half_m + h for x, y, h in taken
+            ):
                 y_m = free
                 break
         taken.append((x_m, y_m, half_m))
