@@ -2,7 +2,7 @@
 
     python -m benchmarks.live.session SEQUENCE [--minutes 30] [--hz 30] [--segmenter none]
 
-A rendered sequence is played forward and backward with the stamps of a camera of that rate, without
+A sequence is played forward and backward with the stamps of a camera of that rate, without
 pauses. Memory is that of each process's own (anonymous) pages, at the end of each
 sixth of the session.
 """

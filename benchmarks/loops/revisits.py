@@ -41,21 +41,18 @@ class Played:
         first = self.ends[1][1] if len(self.ends) > 1 else len(world.landmarks)
         made = world.next_keyframe_id - self.ends[-1][0]
         high_ms = np.percentile(self.system.mapper.update_ms[first_update:], 95)
-        cells = (
-            *(len(self.ends), made, "", int(world.landmarks.in_map.sum()), len(ids) / frames),
-            *((ids < first).sum() / frames, (ids >= self.ends[-1][1]).sum() / frames),
-            *(high_ms, own_mb("self")),
-        )
-        self.rows.append([c if isinstance(c, str) else f"{c:.0f}" for c in cells])
+        old, new = (ids < first).sum() / frames, (ids >= self.ends[-1][1]).sum() / frames
+        cells = [len(self.ends), made, world.landmarks.in_map.sum(), len(ids) / frames, old, new]
+        self.rows.append([f"{cell:.0f}" for cell in (*cells, high_ms, own_mb("self"))])
         self.ends.append((world.next_keyframe_id, len(world.landmarks)))
 
     def lines(self) -> list[list[str]]:
         """The rows with the number of keyframes that are still there."""
         kept = np.array(list(self.system.map.world.keyframes))
         bounds = [end for end, _ in self.ends]
-        for row, number in zip(self.rows, np.histogram(kept, bounds)[0], strict=True):
-            row[2] = str(number)
-        return self.rows
+        numbers = np.histogram(kept, bounds)[0]
+        rows = zip(self.rows, numbers, strict=True)
+        return [[*row[:2], str(number), *row[2:]] for row, number in rows]
 
 
 def play(sequence: Sequence, passes: int, settings: list[str]) -> Played:

@@ -101,10 +101,10 @@ def _strength(smooth: Array) -> float:
 
 
 def _peaks(edges: EdgeScores, weights: Array) -> list[tuple[float, float, float, float]]:
-    """Of each sum of the frames' maps by weights (D, n), each map moved by its flow for a delay:
-    delay in s, shift along u and v in steps, and strength, of the highest value.
+    """Delay in s, shift along u and v in steps, and strength, of each weighted sum of the maps.
 
-    One delay after another, since the maps of all would take 100 MB.
+    ``weights`` (D, n) are of the frames, whose maps are moved by their flow for each of DELAYS_S:
+    one delay after another, since the maps of all would take 100 MB.
     """
     smooth = [gaussian_filter(scores, SMOOTH) for scores in edges.scores]
     by_second = edges.flow_px_s[:, ::-1] / edges.step_px
@@ -122,7 +122,7 @@ def _peaks(edges: EdgeScores, weights: Array) -> list[tuple[float, float, float,
 
 
 def _peak(by_delay: Array, best: Array) -> tuple[float, float, float, float]:
-    """The same of the highest values (T,) by delay and the map (S, S) of the highest of these."""
+    """The same from the highest values (T,) by delay, and the map (S, S) at the best delay."""
     t = int(by_delay.argmax())
     v, u = np.unravel_index(int(best.argmax()), best.shape)
     radius = len(best) // 2

@@ -39,7 +39,11 @@ class LabelStore(IdTables):
     landmarks or ``of_objects``.
     """
 
-    TABLES: ClassVar = ("_log_p", "_views", "_misses", *(f"_{name}" for name in _NEWER))
+    TABLES: ClassVar = {
+        **dict.fromkeys(("_log_p", "_views", "_misses", "_scores"), np.add),
+        "_seen": np.bitwise_or,
+        "_judged": None,
+    }
 
     def __init__(
         self,
@@ -114,22 +118,10 @@ class LabelStore(IdTables):
 
     def move(self, from_ids: Ints, to_ids: Ints) -> None:
         """Add all views of from_ids (N,) to those of to_ids (N,): each pair is one thing."""
-        known, rows = self._found(from_ids)
-        gained = [getattr(self, name)[rows] for name in self.TABLES]
-        self._remove(from_ids)
-        to = self._rows(to_ids[known])
-        for name, values in zip(self.TABLES, gained, strict=True):
-            table = getattr(self, name)
-            if name == "_seen":
-                np.bitwise_or.at(table, to, values)
-            elif name != "_judged":
-                np.add.at(table, to, values)
-        self._bound(to)
-        self._limit_misses(to)
-
-    def drop(self, ids: Ints) -> None:
-        """Reset ids (N,) to the prior."""
-        self._remove(ids)
+        super().move(from_ids, to_ids)
+        rows = self._found(to_ids)[1]
+        self._bound(rows)
+        self._limit_misses(rows)
 
     def known(self) -> Ints:
         """Ids (N,) that had a view, ascending."""
@@ -137,10 +129,8 @@ class LabelStore(IdTables):
 
     def appearance(self, ids: Ints) -> Array:
         """P(class that it looks like) (N, C) of any ids (N,); the prior where there was no view."""
-        inside, rows = self._found(ids)
-        log_p = np.tile(np.log(self._prior), (len(ids), 1))
-        log_p[inside] += self._log_p[rows]
-        log_p[inside, 1:] += self._log_missed(rows)
+        log_p = np.log(self._prior) + self._of(self._log_p, ids)
+        log_p[:, 1:] += self._log_missed(self._of(self._misses, ids))
         p = np.exp(log_p - log_p.max(axis=1, keepdims=True, initial=-np.inf))
         return np.asarray(p / p.sum(axis=1, keepdims=True))
 
@@ -149,14 +139,13 @@ class LabelStore(IdTables):
         p = self.appearance(ids)
         if self.model is None:
             return p
-        (inside, at), scores = self._found(ids), np.zeros((len(ids), 2))
-        scores[inside] = self._scores[at]
+        scores = self._of(self._scores, ids).astype(float)
         scores[:, 0] /= np.maximum(scores[:, 1], 1e-9)
         if self._of_objects:
             return self.model.truth(p, scores, self.model.object_precision(scores))
         right = self.model.thing_precision(scores)
-        judged = self._judged[at]
-        of_label = np.flatnonzero(inside), judged[:, 0].astype(int)
+        judged = self._of(self._judged, ids)
+        of_label = np.arange(len(ids)), judged[:, 0].astype(int)
         odds = right[of_label] / (1 - right[of_label]) * np.exp(judged[:, 1])
         right[of_label] = odds / (1 + odds)
         return self.model.truth(p, scores, right * self.model.on_thing(scores))
@@ -166,17 +155,14 @@ class LabelStore(IdTables):
 
         One that others outvoted by nearly ``max_log_odds`` is forgotten.
         """
-        (inside, rows), log_p = self._found(ids), np.zeros((len(ids), self.classes), np.float32)
-        log_p[inside] = self._log_p[rows]
+        log_p = self._of(self._log_p, ids)
         found: Mask = log_p > log_p.min(axis=1, keepdims=True) + np.float32(_NAMED)
         found[:, 0] = False
         return found
 
     def evidence(self, ids: Ints) -> Array:
         """Number of views (N,) of any ids (N,) by their weights and whether they were new."""
-        (inside, rows), found = self._found(ids), np.zeros(len(ids))
-        found[inside] = self._scores[rows, 1]
-        return found
+        return self._of(self._scores, ids)[:, 1].astype(float)
 
     def judge(self, ids: Ints, labels: Ints, log_factors: Array) -> None:
         """Set what else is known of ids (N,), in place of all that was set before.
@@ -184,14 +170,14 @@ class LabelStore(IdTables):
         A log likelihood (N,) of one class (N,) of the thing that each is on, relative to others.
         """
         self._judged[:] = 0
-        self._remove(self._ids[self._views == 0])  # that only were judged before
+        self.drop(self._ids[self._views == 0])  # that only were judged before
         if len(ids):
             rows = self._rows(ids)
             self._judged[rows] = np.stack([labels, log_factors], axis=1)
 
-    def _log_missed(self, rows: Ints) -> Array:
-        """log P(misses | class) (N, C - 1) or (N, 1) of rows (N,)."""
-        misses, recall = self._misses[rows], None
+    def _log_missed(self, misses: Floats) -> Array:
+        """log P(misses | class) (N, C - 1) or (N, 1) of misses (N, GROUPS or 1)."""
+        recall = None
         if self.model is not None:
             misses, recall = misses[:, self.model.groups[1:]], self.model.best_recall[1:]
         found, some = np.zeros(misses.shape), misses.any(axis=1)  # the others have 0
@@ -203,8 +189,7 @@ class LabelStore(IdTables):
         p = self.probabilities(ids)
         labels = p.argmax(axis=1) if len(ids) else np.zeros(0, np.int64)
         entropy = -(p * np.log(np.maximum(p, 1e-30))).sum(axis=1)
-        (inside, rows), views = self._found(ids), np.zeros(len(ids), np.int64)
-        views[inside] = self._views[rows]
+        views = self._of(self._views, ids).astype(np.int64)
         return LabelEstimates(labels, p[np.arange(len(ids)), labels], entropy, views)
 
     def state(self) -> Arrays:
@@ -255,7 +240,7 @@ class LabelStore(IdTables):
         self._misses[rows] = np.minimum(self._misses[rows], np.float32(self.config.recall_views))
 
     def _clear(self) -> None:
-        super().__init__()
+        self._ids = np.zeros(0, np.int64)
         groups = 1 if self.model is None else GROUPS
         self._log_p: Floats = np.zeros((0, self.classes), np.float32)
         self._views: NDArray[np.int32] = np.zeros(0, np.int32)

@@ -86,7 +86,7 @@ class SurfaceEstimates:
 class SurfaceStore(IdTables):
     """A distribution over the classes of surfaces for every id >= 0, and its number of views."""
 
-    TABLES: ClassVar = ("_log_sums", "_views")
+    TABLES: ClassVar = {"_log_sums": np.add, "_views": np.add}
 
     def __init__(self) -> None:
         self._begin(label_set(()))
@@ -105,29 +105,14 @@ class SurfaceStore(IdTables):
             self._log_sums[at[part]] += gained[part]
         np.add.at(self._views, at, 1)
 
-    def move(self, from_ids: Ints, to_ids: Ints) -> None:
-        """Add all views of from_ids (N,) to those of to_ids (N,): each pair is one thing."""
-        known, rows = self._found(from_ids)
-        sums, views = self._log_sums[rows], self._views[rows]
-        self._remove(from_ids)
-        to = self._rows(to_ids[known])
-        np.add.at(self._log_sums, to, sums)
-        np.add.at(self._views, to, views)
-
-    def drop(self, ids: Ints) -> None:
-        """Forget ids (N,)."""
-        self._remove(ids)
-
     def known(self) -> Ints:
         """Ids (N,) that had a view, ascending."""
         return self._ids
 
     def probabilities(self, ids: Ints) -> Array:
         """Distributions (N, C) of any ids (N,); uniform where there was no view."""
-        sums, views = np.zeros((len(ids), len(self.names) - 1)), np.zeros(len(ids))
-        inside, rows = self._found(ids)
-        sums[inside], views[inside] = self._log_sums[rows], self._views[rows]
-        return pooled(sums, views)
+        sums, views = self._of(self._log_sums, ids), self._of(self._views, ids)
+        return pooled(sums.astype(float), views)
 
     def state(self) -> Arrays:
         """The store as named arrays with one row for each id that had a view."""
@@ -149,7 +134,7 @@ class SurfaceStore(IdTables):
 
     def _begin(self, names: LabelSet) -> None:
         """Begin with an empty store of the classes of a label set."""
-        super().__init__()
+        self._ids = np.zeros(0, np.int64)
         self.names = names
         self._log_sums: Floats = np.zeros((0, len(names) - 1), np.float32)
         self._views: NDArray[np.int32] = np.zeros(0, np.int32)

@@ -49,7 +49,7 @@ class Ring:
         begin = -(-self._written // _ALIGNMENT) * _ALIGNMENT
         read = int(self._position[0])
         is_empty = read >= self._written
-        if is_empty or begin % capacity + size > capacity:  # few pages are used; not over the end
+        if is_empty or begin % capacity + size > capacity:  # at the first page: few are used then
             begin = -(-begin // capacity) * capacity
         oldest = begin if is_empty else read
         if begin + size - oldest > capacity:
