@@ -9,7 +9,7 @@ import numpy as np
 
 from bmask_slam.back_end.triangulation import TriangulationConfig
 from bmask_slam.features.matching import Matches, WindowIndex
-from bmask_slam.graph.arrays import Ints
+from bmask_slam.graph.arrays import Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.loops.verification import LoopConstraint
@@ -28,11 +28,15 @@ class MappingConfig:
     """How many landmarks are made and which are kept.
 
     ``fuse_neighbours`` covisible keyframes are searched for the new landmarks. A landmark is
-    culled if it was found in less than ``min_found_ratio`` of the frames that should have
-    seen it, or if ``probation_keyframes`` after it was made fewer than ``min_observations`` see it;
-    at once if none does.
+    culled if, up to ``probation_keyframes`` after it was made, it was found in less than
+    ``min_found_ratio`` of the frames that should have seen it, or if from then on fewer than
+    ``min_observations`` keyframes see it; at once if none does. Later it is kept however rarely it
+    is found (ORB-SLAM, section VI.B): where the map has more points in view than a frame has
+    keypoints, good landmarks are found rarely too, and a room that is seen again would be mapped
+    again.
     A keyframe is redundant if ``redundant_share`` of its landmarks are seen by at least
-    ``redundant_views`` others.
+    ``redundant_views`` others; landmarks that are found more rarely than ``min_found_ratio`` do
+    not count.
     """
 
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
@@ -144,15 +148,21 @@ def consistent_matches(
 
 
 def cull_landmarks(world: WorldMap, candidates: Ints, config: MappingConfig) -> Ints:
-    """Remove the candidates that are rarely found again or seen by few keyframes; their ids."""
+    """Remove the candidates that are new and rarely found, or seen by few keyframes; their ids."""
     landmarks = world.landmarks
     ids = landmarks.remaining(candidates)
     age, views = world.next_keyframe_id - 1 - landmarks.host[ids], landmarks.observations[ids]
-    rarely = landmarks.found[ids] < config.min_found_ratio * landmarks.visible[ids]
+    rarely = _rarely_found(world, ids, config) & (age <= config.probation_keyframes)
     few = (age >= config.probation_keyframes) & (views < config.min_observations)
     culled = ids[rarely | few | (views == 0)]
     landmarks.remove(culled)
     return culled
+
+
+def _rarely_found(world: WorldMap, ids: Ints, config: MappingConfig) -> Mask:
+    """Whether landmarks are found in too few of the frames that should have seen them."""
+    landmarks = world.landmarks
+    return landmarks.found[ids] < config.min_found_ratio * landmarks.visible[ids]
 
 
 def fuse_loops(
@@ -210,9 +220,13 @@ def remove_redundant(world: WorldMap, history: FrameHistory, keyframe: Keyframe)
 def redundant_keyframe(
     world: WorldMap, candidates: list[Keyframe], config: MappingConfig
 ) -> Keyframe | None:
-    """The first candidate whose landmarks are nearly all seen by enough others, or None."""
+    """The first candidate whose landmarks are nearly all seen by enough others, or None.
+
+    Landmarks that are rarely found say little of what the others see in its place.
+    """
     for keyframe in candidates:
         _, ids = world.observed(keyframe)
+        ids = ids[~_rarely_found(world, ids, config)]
         if len(ids) == 0:
             continue
         often = world.landmarks.observations[ids] > config.redundant_views

@@ -103,6 +103,20 @@ def test_landmarks_rarely_matched_or_observed_once_are_culled() -> None:
     assert not world.landmarks.in_map[culled].any()
 
 
+def test_a_landmark_that_stood_its_test_is_kept_however_rarely_it_is_matched() -> None:
+    world, _, keyframes = scene(2)
+    ids = create_landmarks(world, keyframes[0], CAMERA)
+    world.attach(keyframes[1], np.arange(60), ids)
+    world.landmarks.visible[ids] = 100
+    world.landmarks.found[ids] = 10
+    world.next_keyframe_id = 1 + CONFIG.probation_keyframes  # the newest is that old a keyframe
+    before = world.landmarks.in_map.copy()
+    assert sorted(cull_landmarks(world, ids, CONFIG)) == sorted(ids)
+    world.landmarks.in_map[:] = before
+    world.next_keyframe_id += 1
+    assert len(cull_landmarks(world, ids, CONFIG)) == 0
+
+
 def test_a_new_landmark_is_not_culled_yet() -> None:
     world, _, keyframes = scene(2)
     ids = create_landmarks(world, keyframes[1], CAMERA)
@@ -118,6 +132,10 @@ def test_only_a_keyframe_without_own_landmarks_is_redundant() -> None:
     alone = ids[50:]
     world.landmarks.observations[alone] = 1
     assert redundant_keyframe(world, [keyframes[2]], CONFIG) is None
+    world.landmarks.visible[alone] = 100  # and hardly ever seen again
+    assert redundant_keyframe(world, [keyframes[2]], CONFIG) is keyframes[2]
+    world.landmarks.visible[ids] = 100
+    assert redundant_keyframe(world, [keyframes[2]], CONFIG) is None  # nothing speaks for it
 
 
 def test_local_map_holds_the_landmarks_of_covisible_keyframes() -> None:

@@ -191,15 +191,17 @@ def test_a_run_that_continues_a_map_looks_again_and_the_map_follows(
     late_sweep: Path, sweep_camera: Camera, quick: None, tmp_path: Path
 ) -> None:
     """Here that was too short to be looked at. The stamps of both begin with the same ones."""
-    first = run(replace(late_options(late_sweep, tmp_path / "first"), max_frames=30))
-    options = replace(late_options(late_sweep, tmp_path / "on"), map=first.folder)
+    config = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
+    options = replace(late_options(late_sweep, tmp_path / "first"), config=config)
+    first = run(replace(options, max_frames=30))
+    options = replace(options, out=tmp_path / "on", map=first.folder, max_frames=None)
     done = run(options)
     assert done.calibration.endswith("found and applied")
     camera = read_camera(done.folder / "camera.yaml")
     assert camera.depth_time_offset_s == pytest.approx(sweep_camera.depth_time_offset_s, abs=0.003)
     assert read_run(done.folder).camera == camera
-    off = run(replace(options, out=tmp_path / "off", calibrate="off"))
-    assert ate_m(done) < 1.1 * ate_m(off)
+    alone = run(replace(options, out=tmp_path / "alone", map=None))
+    assert ate_m(done) < 1.25 * ate_m(alone)  # 0.7 to 1.1 with other grids of keypoints
 
 
 def test_few_frames_that_continue_a_map_do_not_change_its_camera(
