@@ -109,7 +109,7 @@ def test_a_landmark_that_stood_its_test_is_kept_however_rarely_it_is_matched() -
     world.attach(keyframes[1], np.arange(60), ids)
     world.landmarks.visible[ids] = 100
     world.landmarks.found[ids] = 10
-    world.next_keyframe_id = 1 + CONFIG.probation_keyframes  # the newest is that old a keyframe
+    world.next_keyframe_id = 1 + CONFIG.probation_keyframes  # the newest keyframe ends the test
     before = world.landmarks.in_map.copy()
     assert sorted(cull_landmarks(world, ids, CONFIG)) == sorted(ids)
     world.landmarks.in_map[:] = before
