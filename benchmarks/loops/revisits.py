@@ -40,7 +40,8 @@ class Played:
         ids, frames = np.concatenate(observed), len(observed)
         first = self.ends[1][1] if len(self.ends) > 1 else len(world.landmarks)
         made = world.next_keyframe_id - self.ends[-1][0]
-        high_ms = np.percentile(self.system.mapper.update_ms[first_update:], 95)
+        updates_ms = self.system.mapper.update_ms[first_update:] or [0.0]  # of no new keyframe
+        high_ms = np.percentile(updates_ms, 95)
         old, new = (ids < first).sum() / frames, (ids >= self.ends[-1][1]).sum() / frames
         cells = [len(self.ends), made, world.landmarks.in_map.sum(), len(ids) / frames, old, new]
         self.rows.append([f"{cell:.0f}" for cell in (*cells, high_ms, own_mb("self"))])
