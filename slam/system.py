@@ -77,7 +77,9 @@ class SlamSystem(SavedSystem):
         self.moving_objects = MovingObjectFilter(
             camera, config.moving_objects, config.features, self.map, self.camera_tracker
         )
-        self.keyframes = KeyframeDecision(camera, config.keyframes, self.map, self.camera_tracker)
+        self.keyframes = KeyframeDecision(
+            camera, config.keyframes, self.map, self.camera_tracker, config.mapping.min_found_ratio
+        )
         self.semantics = SemanticMapper(
             camera, config.semantics, self.map, segmenter, self.moving_objects.observe_masks
         )

@@ -9,7 +9,7 @@ import numpy as np
 
 from bmask_slam.back_end.triangulation import TriangulationConfig
 from bmask_slam.features.matching import Matches, WindowIndex
-from bmask_slam.graph.arrays import Ints, Mask
+from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.loops.verification import LoopConstraint
@@ -152,17 +152,12 @@ def cull_landmarks(world: WorldMap, candidates: Ints, config: MappingConfig) -> 
     landmarks = world.landmarks
     ids = landmarks.remaining(candidates)
     age, views = world.next_keyframe_id - 1 - landmarks.host[ids], landmarks.observations[ids]
-    rarely = _rarely_found(world, ids, config) & (age <= config.probation_keyframes)
+    rarely = landmarks.rarely_found(ids, config.min_found_ratio)
+    rarely &= age <= config.probation_keyframes
     few = (age >= config.probation_keyframes) & (views < config.min_observations)
     culled = ids[rarely | few | (views == 0)]
     landmarks.remove(culled)
     return culled
-
-
-def _rarely_found(world: WorldMap, ids: Ints, config: MappingConfig) -> Mask:
-    """Whether landmarks are found in too few of the frames that should have seen them."""
-    landmarks = world.landmarks
-    return landmarks.found[ids] < config.min_found_ratio * landmarks.visible[ids]
 
 
 def fuse_loops(
@@ -226,7 +221,7 @@ def redundant_keyframe(
     """
     for keyframe in candidates:
         _, ids = world.observed(keyframe)
-        ids = ids[~_rarely_found(world, ids, config)]
+        ids = ids[~world.landmarks.rarely_found(ids, config.min_found_ratio)]
         if len(ids) == 0:
             continue
         often = world.landmarks.observations[ids] > config.redundant_views

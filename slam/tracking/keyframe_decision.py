@@ -23,21 +23,23 @@ class KeyframeConfig:
     """Parameters of the decision; ``rule`` is "orb" (default) or "paper".
 
     "orb" (ORB-SLAM, section V.E, with ORB-SLAM2's extra rule): mapping is idle or more than
-    ``max_interval_frames`` have passed, at least ``min_tracked`` points are tracked, and the shared
-    view is below ``max_shared`` or, ``late_frames`` after the last keyframe, below ``late_shared``;
-    or the close points run out: fewer than ``min_close_tracked`` are tracked while
-    ``min_close_new`` could be made. ORB-SLAM's 90 % counts only points that three keyframes see;
-    here all points of the reference keyframe count, of which BRISK finds about 60 % again in the
-    next frame, so that 0.5 is the equivalent. In front of a flat wall a slow camera keeps half of
-    its points for seconds, and only new points show the motion along the wall; hence
-    ``late_shared``. In a fast turn a view is gone within three frames: below ``urgent_shared``
-    neither ``min_interval_frames`` nor mapping is waited for, so that there are landmarks enough to
-    place the keyframe. The reference keyframe is the last one. If another keyframe shares more with
-    a frame that is to become a keyframe, and at least ``known_shared`` of its points, that one
-    becomes the reference, and the next frame is decided against it: a known view needs no new
-    keyframe. Nor do close points that run out where a keyframe shares half of its points, from
-    ``known_after_s`` before: those that could be made were made then, and are not found again. With
-    ``max_shared`` of 1 or more these rules are off.
+    ``max_interval_frames`` have passed, at least ``min_tracked`` points are tracked, and the
+    shared view is below ``max_shared`` or, ``late_frames`` after the last keyframe, below
+    ``late_shared``; or the close points run out: fewer than ``min_close_tracked`` are tracked
+    while ``min_close_new`` could be made. ORB-SLAM's 90 % counts only points that three keyframes
+    see; here those of the reference keyframe's points count that are found in at least
+    ``mapping.min_found_ratio`` of the frames that should show them, so that 0.6 is the equivalent.
+    In a room that is seen again more points are in view than a frame has keypoints; if those that
+    are found rarely counted too, a known view would look like a new one. In front of a flat wall a
+    slow camera keeps half of its points for seconds, and only new points show the motion along the
+    wall; hence ``late_shared``. In a fast turn a view is gone within three frames: below
+    ``urgent_shared`` neither ``min_interval_frames`` nor mapping is waited for, so that there are
+    landmarks enough to place the keyframe. The reference keyframe is the last one. If another
+    keyframe shares more with a frame that is to become a keyframe, and at least ``known_shared``
+    of its points, that one becomes the reference, and the next frame is decided against it: a
+    known view needs no new keyframe. Nor do close points that run out where a keyframe from
+    ``known_after_s`` before shares ``max_shared`` of its points: those that could be made were
+    made then, and are not found again. With ``max_shared`` of 1 or more these rules are off.
     "paper" (Algorithm 2 as printed): at least ``paper_interval_frames`` since the last keyframe AND
     mapping idle AND less than ``paper_shared`` shared AND at least ``paper_min_matches`` matches.
     """
@@ -46,10 +48,10 @@ class KeyframeConfig:
     min_interval_frames: int = 3
     max_interval_frames: int = 20
     min_tracked: int = 50
-    max_shared: float = 0.5
+    max_shared: float = 0.6
     late_frames: int = 10
-    late_shared: float = 0.6
-    urgent_shared: float = 0.4
+    late_shared: float = 0.7
+    urgent_shared: float = 0.5
     known_shared: float = 0.25
     known_after_s: float = 20.0
     min_close_tracked: int = 100
@@ -67,7 +69,7 @@ class KeyframeEvidence:
         frames_since: frames since the last keyframe was made.
         mapping_idle: the back end waits for work; True in an offline run, so that runs repeat.
         tracked: landmarks tracked in this frame.
-        shared: tracked points over the points of the reference keyframe.
+        shared: tracked points over the points of the reference keyframe that are often found.
         close_tracked: tracked landmarks at close range.
         close_new: keypoints at close range that are not tracked.
     """
@@ -93,8 +95,10 @@ class KeyframeDecision:
         config: KeyframeConfig,
         map_reader: MapReader,
         camera_tracker: CameraTracker,
+        min_found_ratio: float,
     ) -> None:
         self.config = config
+        self._min_found_ratio = min_found_ratio
         self.frames_since = 0
         self._close_m = CLOSE_BASELINES * camera.baseline_m
         self._map = map_reader
@@ -122,14 +126,13 @@ class KeyframeDecision:
         self.frames_since = 0
 
     def _evidence(self, tracked: Tracked, reference: Keyframe) -> KeyframeEvidence:
-        _, points = self._map.world.observed(reference)
         close = tracked.features.depth_m < self._close_m
         close_tracked = int(close[tracked.keypoints].sum())
         return KeyframeEvidence(
             frames_since=self.frames_since,
             mapping_idle=self._map.idle,
             tracked=len(tracked.landmark_ids),
-            shared=len(tracked.landmark_ids) / max(len(points), 1),
+            shared=len(tracked.landmark_ids) / max(self._often_found(reference), 1),
             close_tracked=close_tracked,
             close_new=int(close.sum()) - close_tracked,
         )
@@ -147,20 +150,25 @@ class KeyframeDecision:
         if not strong or strong[0][1] is reference:
             return False
         shared, other = strong[0]
-        _, points = self._map.world.observed(other)
-        if shared < self.config.known_shared * len(points):
+        if shared < self.config.known_shared * self._often_found(other):
             return False
         self._camera_tracker.refer_to(other)
         return True
 
     def _is_revisited(self, strong: list[tuple[int, Keyframe]]) -> bool:
-        """Whether an old keyframe shares half of its points."""
+        """Whether an old keyframe shares ``max_shared`` of its points."""
         now_s, after_s = self._camera_tracker.timestamp_s, self.config.known_after_s
         return any(
             abs(now_s - keyframe.timestamp_s) >= after_s
-            and shared >= self.config.max_shared * len(self._map.world.observed(keyframe)[1])
+            and shared >= self.config.max_shared * self._often_found(keyframe)
             for shared, keyframe in strong
         )
+
+    def _often_found(self, keyframe: Keyframe) -> int:
+        """How many of the landmarks that a keyframe observes are found often enough to count."""
+        world = self._map.world
+        _, ids = world.observed(keyframe)
+        return len(ids) - int(world.landmarks.rarely_found(ids, self._min_found_ratio).sum())
 
 
 def keyframe_reason(evidence: KeyframeEvidence, config: KeyframeConfig) -> str:

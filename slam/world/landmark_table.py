@@ -156,6 +156,10 @@ class LandmarkTable:
         ids = ids[ids >= 0]
         return ids[self.in_map[ids]]
 
+    def rarely_found(self, ids: Ints, ratio: float) -> Mask:
+        """Whether landmarks (N,) were found in less than this share of the frames to show them."""
+        return self.found[ids] < ratio * self.visible[ids]
+
     def current(self, ids: Ints) -> Ints:
         """The present ids (N,) of landmarks (N,) that may have been fused since, in the same order.
 

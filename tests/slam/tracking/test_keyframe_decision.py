@@ -15,6 +15,8 @@ from bmask_slam.tracking.keyframe_decision import (
     KeyframeEvidence,
     keyframe_reason,
 )
+from bmask_slam.tracking.results import TrackingStatus
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
 # Numbers of their own, so that the tables do not follow the defaults about.
@@ -110,6 +112,21 @@ def test_the_default_rule_equals_orb_slams() -> None:
     )
 
 
+POINTS = 20
+
+
+def decision_at(now_s: float, config: KeyframeConfig) -> tuple[KeyframeDecision, Keyframe]:
+    """The decision for frames at a time, against a keyframe of 100 s with ``POINTS`` landmarks."""
+    world, points = WorldMap(), points_before(np.eye(4), POINTS, np.random.default_rng(1))
+    features = make_features(np.eye(4), points, np.zeros((POINTS, 8), np.uint64))
+    keyframe = add_keyframe(world, np.eye(4), features)
+    keyframe.timestamp_s = 100.0
+    world.make_landmarks(keyframe, np.arange(POINTS), points)
+    tracker: Any = SimpleNamespace(timestamp_s=now_s, reference=keyframe, segment=0)
+    map_reader: Any = SimpleNamespace(world=world, idle=True, accepts_keyframes=True)
+    return KeyframeDecision(CAMERA, config, map_reader, tracker, 0.25), keyframe
+
+
 @pytest.mark.parametrize(
     ("now_s", "shared", "is_known"),
     [(120.0, 10, True), (119.9, 10, False), (120.0, 9, False), (60.0, 10, True)],
@@ -117,13 +134,31 @@ def test_the_default_rule_equals_orb_slams() -> None:
 def test_close_points_may_run_out_where_an_old_keyframe_shows_the_view(
     now_s: float, shared: int, is_known: bool
 ) -> None:
-    world, points = WorldMap(), points_before(np.eye(4), 20, np.random.default_rng(1))
-    features = make_features(np.eye(4), points, np.zeros((20, 8), np.uint64))
-    keyframe = add_keyframe(world, np.eye(4), features)
-    keyframe.timestamp_s = 100.0
-    ids = world.make_landmarks(keyframe, np.arange(20), points)
-    tracker: Any = SimpleNamespace(timestamp_s=now_s, reference=keyframe)
-    map_reader: Any = SimpleNamespace(world=world)
-    decision = KeyframeDecision(CAMERA, KeyframeConfig(), map_reader, tracker)
+    decision, keyframe = decision_at(now_s, KeyframeConfig(max_shared=0.5))
+    ids = keyframe.landmark_ids
     assert decision._is_known_view(ids[:shared], keyframe, STARVING) is is_known
     assert not decision._is_known_view(ids, keyframe, "new view")
+
+
+@pytest.mark.parametrize(
+    ("rarely_found", "shared", "reason"),
+    [(0, 11, "new view"), (0, 12, ""), (10, 5, "new view"), (10, 6, "")],
+)
+def test_landmarks_that_are_rarely_found_make_no_view_new(
+    rarely_found: int, shared: int, reason: str
+) -> None:
+    """Of 20 landmarks 12 are 60 %; if 10 are found in a fifth of the frames, 6 of the others."""
+    config = KeyframeConfig(max_shared=0.6, min_tracked=0, min_close_tracked=0)
+    decision, keyframe = decision_at(101.0, config)
+    landmarks = decision._map.world.landmarks
+    landmarks.visible[:] = 20
+    landmarks.found[:] = 5
+    landmarks.found[POINTS - rarely_found :] = 4
+    tracked: Any = SimpleNamespace(
+        status=TrackingStatus.OK,
+        features=keyframe.features,
+        landmark_ids=keyframe.landmark_ids[:shared],
+        keypoints=np.arange(shared),
+    )
+    decision.frames_since = config.min_interval_frames
+    assert decision.decide(tracked) == reason
