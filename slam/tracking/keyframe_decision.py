@@ -28,7 +28,7 @@ class KeyframeConfig:
     ``late_shared``; or the close points run out: fewer than ``min_close_tracked`` are tracked
     while ``min_close_new`` could be made. ORB-SLAM's 90 % counts only points that three keyframes
     see; here those of the reference keyframe's points count that are found in at least
-    ``mapping.min_found_ratio`` of the frames that should show them, so that 0.6 is the equivalent.
+    ``mapping.min_found_ratio`` of the frames that should show them, so that 0.55 is the equivalent.
     In a room that is seen again more points are in view than a frame has keypoints; if those that
     are found rarely counted too, a known view would look like a new one. In front of a flat wall a
     slow camera keeps half of its points for seconds, and only new points show the motion along the
@@ -48,10 +48,10 @@ class KeyframeConfig:
     min_interval_frames: int = 3
     max_interval_frames: int = 20
     min_tracked: int = 50
-    max_shared: float = 0.6
+    max_shared: float = 0.55
     late_frames: int = 10
-    late_shared: float = 0.7
-    urgent_shared: float = 0.5
+    late_shared: float = 0.65
+    urgent_shared: float = 0.45
     known_shared: float = 0.25
     known_after_s: float = 20.0
     min_close_tracked: int = 100

@@ -270,6 +270,8 @@ def test_an_older_file_is_read_with_the_present_names_of_its_settings(tmp_path: 
         "features.thresholds",
         "factor_selection.full_keyframes",
         "graph.relinearize_threshold",
+        "keyframes.max_shared",
+        "keyframes.late_shared",
     }
     assert set(differing) <= {set_by_conftest, of_the_camera_now, *other_defaults}
     read = from_text(SystemConfig, older.read_text(encoding="utf-8"), "here")
