@@ -29,7 +29,7 @@ from bmask_slam.tracking.results import FrameResult
 logger = logging.getLogger(__name__)
 
 KEPT = 3
-"""Largest number of frames that wait for tracking otherwise; one more drops all older ones."""
+"""Number of frames that wait for tracking otherwise; of more than these some are dropped."""
 STOP_S = 1.0
 """Longest wait for the thread that reads the source, before the source may be played again."""
 WAITING = 1

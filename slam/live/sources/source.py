@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import asdict, dataclass
 from itertools import islice
@@ -16,6 +16,9 @@ from bmask_slam.sequences.frame import Frame, reduced_frame
 from bmask_slam.sequences.images import working_camera
 
 T = TypeVar("T")
+
+MAX_QUEUED = 16
+"""Largest number of items that wait for a consumer in `Newest`; of one more every second is dropped."""
 
 MAX_AHEAD_S = 0.1
 """Longest interval in half of which ``paced`` sleeps before it reads the next frame."""
@@ -176,15 +179,15 @@ def _sleep_until(time_s: float) -> None:
 
 
 class Newest(Generic[T]):
-    """Reads an iterator in a thread and queues a few items; one too many drops all older ones.
+    """Reads an iterator in a thread and queues its items for a consumer that may be too slow.
 
+    Where more than ``keep`` wait, the consumer gets the newest and at most half of the others,
+    spread evenly, so that a stall of the consumer leaves no gap as long as itself, and little more
+    delay than the queue holds.
     The thread is a daemon: a driver that does not return from a call does not keep the program.
 
-    A short stall of the consumer costs no item, and a long one adds no more delay than the queue
-    holds.
-
     Attributes:
-        dropped: items that the consumer did not fetch in time.
+        dropped: items that the consumer did not get.
     """
 
     def __init__(self, items: Iterator[T], keep: int) -> None:
@@ -206,6 +209,7 @@ class Newest(Generic[T]):
         with self._changed:
             self._changed.wait_for(lambda: self._kept or self._end.done(), timeout_s)
             if self._kept:
+                self._thin()
                 return self._kept.pop(0)
         if self._end.done():
             self._end.result()
@@ -227,19 +231,29 @@ class Newest(Generic[T]):
             for item in self._items:
                 if self._stopped:
                     break
-                self._keep_newest(item)
+                self._add(item)
         except BaseException as error:  # noqa: BLE001 - ``get`` raises it
             self._end.set_exception(error)
         else:
             self._end.set_result(None)
 
-    def _keep_newest(self, item: T) -> None:
+    def _add(self, item: T) -> None:
         with self._changed:
             self._kept.append(item)
-            if len(self._kept) > self._keep:
-                self.dropped += len(self._kept) - 1
-                del self._kept[:-1]
+            if len(self._kept) > MAX_QUEUED:
+                self._drop_but(range(0, len(self._kept), 2))
             self._changed.notify()
+
+    def _thin(self) -> None:
+        """Drop items if too many wait."""
+        waiting = len(self._kept)
+        if waiting > self._keep:
+            count = min(self._keep, waiting // 2)
+            self._drop_but([(k + 1) * waiting // count - 1 for k in range(count)])
+
+    def _drop_but(self, indices: Sequence[int]) -> None:
+        self.dropped += len(self._kept) - len(indices)
+        self._kept = [self._kept[k] for k in indices]
 
     def _notify(self) -> None:
         with self._changed:

@@ -76,16 +76,32 @@ def test_items_consumed_in_time_are_all_delivered_in_order() -> None:
     assert newest.dropped == 0
 
 
-def test_a_slow_consumer_gets_the_newest_and_drops_are_counted() -> None:
-    newest = filled(10, keep=2)
-    assert consume_all(newest) == [8, 9]
-    assert newest.dropped == 8
+@pytest.mark.parametrize(
+    ("items", "keep", "given"),
+    [
+        (3, 3, [0, 1, 2]),
+        (4, 3, [1, 3]),
+        (5, 3, [1, 4]),
+        (6, 3, [1, 3, 5]),
+        (8, 3, [1, 4, 7]),
+        (2, 1, [1]),
+        (13, 3, [3, 7, 12]),
+        (18, 2, [8, 17]),  # of 17 every second had stayed
+    ],
+)
+def test_a_slow_consumer_gets_items_spread_evenly_up_to_the_newest(
+    items: int, keep: int, given: list[int]
+) -> None:
+    newest = filled(items, keep)
+    assert consume_all(newest) == given
+    assert newest.dropped == items - len(given)
 
 
-def test_an_overflow_keeps_only_the_newest() -> None:
-    newest = filled(6, keep=3)
-    assert consume_all(newest) == [3, 4, 5]  # 3 drove out the others
-    assert newest.dropped == 3
+def test_a_long_stall_leaves_few_items_in_memory() -> None:
+    newest = filled(1000, keep=3)
+    given = consume_all(newest)
+    assert given[-1] == 999
+    assert len(given) == 3
 
 
 def test_an_error_of_the_source_is_raised_after_its_frames() -> None:
