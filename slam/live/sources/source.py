@@ -18,7 +18,7 @@ from bmask_slam.sequences.images import working_camera
 T = TypeVar("T")
 
 MAX_QUEUED = 16
-"""Largest number of items that wait for a consumer in `Newest`; of one more every second is dropped."""
+"""Largest number of items that `Newest` queues; with one more, every second is dropped."""
 
 MAX_AHEAD_S = 0.1
 """Longest interval in half of which ``paced`` sleeps before it reads the next frame."""

@@ -363,7 +363,7 @@ def test_a_disk_that_fails_is_named_with_the_file(capsys, sequence: Path) -> Non
     assert (status, errors[: len(expected)]) == (1, expected)
 
 
-def test_a_signal_while_a_library_loads(capsys, monkeypatch) -> None:
+def test_a_signal_while_a_library_loads(capsys, monkeypatch, request) -> None:
     """GTSAM's loader turns what is raised in it into an ImportError."""
 
     def load(arguments: object) -> int:
@@ -374,6 +374,8 @@ def test_a_signal_while_a_library_loads(capsys, monkeypatch) -> None:
         return 0
 
     monkeypatch.setattr(sequences, "_info", load)
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)  # Ray sets one where it was begun
+    request.addfinalizer(lambda: signal.signal(signal.SIGTERM, before))
     for number, said in ((signal.SIGINT, "interrupted"), (signal.SIGTERM, "ended by SIGTERM")):
         assert call(capsys, "info", "x") == (128 + number, "", f"{said}\n")
 

@@ -51,14 +51,17 @@ from bmask_slam.system_config import SystemConfig
 CONFIG = resolve(
     SystemConfig, None, ("semantics.segmenter.name=none", "features.max_keypoints=400")
 )
+DETAILED = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
 
 STEP_S = 1 / 15
 
 
-def played(sequence: Sequence, out: Path, calibrate: str) -> LiveSlam:
+def played(
+    sequence: Sequence, out: Path, calibrate: str, config: SystemConfig = CONFIG
+) -> LiveSlam:
     source = RecordedSource(sequence, realtime=False)
     options = LiveOptions(out, calibrate=calibrate, straightens=True, pairs=True, interpolates=True)
-    with LiveSlam(source.camera, CONFIG, options) as slam:
+    with LiveSlam(source.camera, config, options) as slam:
         assert play(slam, source, PlayOptions(realtime=False, quiet=True)) is None
     assert source.camera == slam.camera
     return slam
@@ -77,14 +80,14 @@ def short_stretch(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_delay_is_found_and_used(late_sweep, sweep_camera, short_stretch, tmp_path) -> None:
     late, delay_s = open_sequence(late_sweep), sweep_camera.depth_time_offset_s
-    slam = played(late, tmp_path / "run", "auto")
+    slam = played(late, tmp_path / "run", "auto", DETAILED)
     assert slam.calibration.endswith("found and applied")
     assert slam.camera.depth_time_offset_s == pytest.approx(delay_s, abs=0.004)
     assert slam.camera.rolling_shutter_s == pytest.approx(0.0, abs=0.002)
     run = tmp_path / "run"
     assert read_camera(run / "camera.yaml") == slam.camera
     assert read_run(run).camera == read_map(run)[1] == slam.camera
-    told = played(late, tmp_path / "told", "report")
+    told = played(late, tmp_path / "told", "report", DETAILED)
     assert told.calibration.endswith("found, not applied")
     assert told.camera.depth_time_offset_s == 0 and not (tmp_path / "told/camera.yaml").exists()
 

@@ -65,6 +65,7 @@ from bmask_slam.system_config import SystemConfig
 CONFIG = resolve(
     SystemConfig, None, ("semantics.segmenter.name=none", "features.max_keypoints=400")
 )
+DETAILED = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
 FRAMES = 90
 """The fewest that are looked at."""
 KILLED = (5, 7)
@@ -447,7 +448,7 @@ def test_after_the_last_frame_keyframes_get_the_depth_of_the_camera_found(
     sequence, right = open_sequence(late_sweep, camera=third), open_sequence(late_sweep)
     right = right.with_camera(sweep_camera)
     with closing(ParallelSystems(CONFIG.semantics.segmenter, late_sweep, Upright())) as systems:
-        system = systems(third, CONFIG) if parallel else SlamSystem(third, CONFIG)
+        system = systems(third, DETAILED) if parallel else SlamSystem(third, DETAILED)
         for frame in sequence.frames(0, FRAMES):
             system.process(frame)
         before_m = _depth_error_m(system, right)

@@ -171,9 +171,12 @@ def test_dense_clouds(labelled: Run) -> None:
     assert "desk" in set(cloud.labels.tolist())
     assert (cloud.sigmas_m > 0).all()
     by_id = {o.id: o for o in labelled.objects}
+    inside = []
     for number, part in labelled.object_clouds.items():
         assert set(part.labels.tolist()) == {by_id[number].label}
-        assert by_id[number].box.contains(part.points_world).mean() > 0.8
+        inside.append(by_id[number].box.contains(part.points_world))
+    assert np.concatenate(inside).mean() > 0.9
+    assert min(points.mean() for points in inside) > 0.7  # of small ones, boxes of few landmarks
 
 
 def test_the_camera_is_that_of_the_sequence(labelled: Run) -> None:
