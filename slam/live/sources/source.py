@@ -181,9 +181,9 @@ def _sleep_until(time_s: float) -> None:
 class Newest(Generic[T]):
     """Reads an iterator in a thread and queues its items for a consumer that may be too slow.
 
-    Where more than ``keep`` wait, the consumer gets the newest and at most half of the others,
-    spread evenly, so that a stall of the consumer leaves no gap as long as itself, and little more
-    delay than the queue holds.
+    Where more than ``keep`` wait, the consumer gets at most half of them, and at most ``keep``,
+    spread evenly up to the newest: a stall of the consumer leaves no gap as long as itself, and
+    little more delay than the queue holds.
     The thread is a daemon: a driver that does not return from a call does not keep the program.
 
     Attributes:
