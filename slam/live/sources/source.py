@@ -19,7 +19,6 @@ T = TypeVar("T")
 
 MAX_QUEUED = 16
 """Largest number of items that `Newest` queues; with one more, every second is dropped."""
-
 MAX_AHEAD_S = 0.1
 """Longest interval in half of which ``paced`` sleeps before it reads the next frame."""
 MAX_WAIT_S = 10.0

@@ -35,7 +35,11 @@ def labelled(
     """A short run with exact masks, covariances and a dense map."""
     office = rendered(RenderConfig("office", 16, fps=8.0, width=320, height=240))
     folder = tmp_path_factory.mktemp("reader")
-    settings = {"covariances": True, "semantics.segmenter.min_score": 0.5}
+    settings = {
+        "covariances": True,
+        "semantics.segmenter.min_score": 0.5,
+        "features.max_keypoints": 1500,  # enough for the boxes of small objects
+    }
     found = run(office, folder / "run", segmenter="truth", settings=settings)
     return map_run(found, voxel_m=0.02)
 
@@ -171,12 +175,9 @@ def test_dense_clouds(labelled: Run) -> None:
     assert "desk" in set(cloud.labels.tolist())
     assert (cloud.sigmas_m > 0).all()
     by_id = {o.id: o for o in labelled.objects}
-    inside = []
     for number, part in labelled.object_clouds.items():
         assert set(part.labels.tolist()) == {by_id[number].label}
-        inside.append(by_id[number].box.contains(part.points_world))
-    assert np.concatenate(inside).mean() > 0.9
-    assert min(points.mean() for points in inside) > 0.7  # of small ones, boxes of few landmarks
+        assert by_id[number].box.contains(part.points_world).mean() > 0.8
 
 
 def test_the_camera_is_that_of_the_sequence(labelled: Run) -> None:
