@@ -108,7 +108,7 @@ class SlamSystem(SavedSystem):
         if keyframe:
             self._optimise(keyframe)
             self._close_loops(keyframe)
-            self._label(frame, keyframe, static)
+        self._label(frame, tracked, keyframe, static)
         return FrameResult(
             index=frame.index,
             timestamp_s=frame.timestamp_s,
@@ -244,7 +244,12 @@ class SlamSystem(SavedSystem):
         self.camera_tracker.refer_to(keyframe)
 
     @stage("semantics")
-    def _label(self, frame: Frame, keyframe: Keyframe, static: StaticFeatures) -> None:
+    def _label(
+        self, frame: Frame, tracked: Tracked, keyframe: Keyframe | None, static: StaticFeatures
+    ) -> None:
+        if keyframe is None:
+            self.semantics.observe_frame(frame, tracked, self.camera_tracker.reference)
+            return
         self.moving_objects.store_keyframe(keyframe, static)
         urgent = self.map.world.is_alone(keyframe) or self.moving_objects.is_crowded(static)
         self.semantics.observe(frame, keyframe, urgent)

@@ -44,10 +44,12 @@ NEWER_ARRAYS = (
     "localiser.images.",
     "frames.",
     "semantics.surfaces.",
+    "semantics.views.",
+    "label_views.",
 )
 """Beginnings of the names of arrays that older files lack; an empty system's are used then."""
 OPTIONAL_ARRAYS = (
-    *("landmarks.spare", "s.measured", "upright.points", "upright.sides"),
+    *("landmarks.spare", "world.label_views", "s.measured", "upright.points", "upright.sides"),
     *("labels.scores", "labels.seen", "labels.judged"),
     *("votes.coded", "votes.cell_px", "votes.codes_shape", "votes.codes", "points.covered"),
 )

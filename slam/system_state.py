@@ -55,6 +55,7 @@ class SavedSystem(SensorSystem):
             "reference": np.array(-1 if reference is None else reference.id),
             "frames_since_keyframe": np.array(self.keyframes.frames_since),
             "first_keyframe": np.array(self._first_keyframe),
+            **nested(label_views=self.semantics.decision.state()),
         }
 
     def _restore_progress(self, state: Arrays) -> None:
@@ -62,6 +63,7 @@ class SavedSystem(SensorSystem):
         self.camera_tracker.reference = self.map.world.keyframes.get(int(state["reference"]))
         self.keyframes.frames_since = int(state["frames_since_keyframe"])
         self._first_keyframe = int(state["first_keyframe"])
+        self.semantics.decision.restore(part(state, "label_views"))
 
     def restart(self) -> None:
         """Rebuild what a state cannot hold: from here on the system goes on like a restored one."""

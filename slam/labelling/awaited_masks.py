@@ -44,7 +44,7 @@ class AwaitingKeyframes(dict[int, AwaitingKeyframe]):
         """Add one; the oldest is given up if there are too many."""
         self[keyframe_id] = awaiting
         if len(self) > MAX_AWAITING:
-            del self[min(self)]
+            del self[next(iter(self))]
 
     def take(self, keyframe_id: int, size: tuple[int, ...]) -> AwaitingKeyframe:
         """A keyframe, which waits no more; one without a stamp and depths, if it did not."""

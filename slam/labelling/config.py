@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from bmask_slam.labelling.label_views import LabelViewConfig
 from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
 from bmask_slam.semantics.beliefs.vote_config import VoteConfig
 from bmask_slam.semantics.instances.instances import Instance
@@ -22,6 +23,7 @@ class SemanticsConfig:
     instances vote on labels, and those with a class score of ``object_score`` or more make objects.
     Of others, which are believed, instances vote from ``object_score`` and make objects from
     ``sure_score``. From that on instances are evidence of motion and reach the dense map.
+    Keyframes are segmented, and other frames where ``label_views`` says so.
     """
 
     segmenter: SegmenterOptions = field(
@@ -29,6 +31,7 @@ class SemanticsConfig:
     )
     object_score: float = 0.3
     sure_score: float = 0.5
+    label_views: LabelViewConfig = field(default_factory=LabelViewConfig)
     votes: VoteConfig = field(default_factory=VoteConfig)
     labels: LabelStoreConfig = field(default_factory=LabelStoreConfig)
     objects: ObjectConfig = field(default_factory=ObjectConfig)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Floats, Ints, Mask, step_of
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
+from bmask_slam.labelling.label_views import LabelView
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.map_editor import MapReader
 from bmask_slam.world.world_map import WorldMap
@@ -21,9 +22,10 @@ _NINE = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).re
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """Pixels (N, 2), as detected, and landmark ids (N,) of a keyframe, which may be culled.
+    """Pixels (N, 2), as detected, and landmark ids (N,) of a keyframe or label view.
 
-    Its pose is relative to a keyframe of the map, ``anchor``: itself or its parent.
+    Its pose is relative to a keyframe of the map, ``anchor``: itself, or the parent of one that was
+    culled or of a label view.
     """
 
     pixels: Array
@@ -158,19 +160,25 @@ def visible_landmarks(
     return Sightings(views, ids[rows], pixels[on_surface], z_m[on_surface])
 
 
-def observed_by(keyframe_id: int, map_reader: MapReader) -> Observed | None:
-    """The landmarks of the map that a keyframe, which may be culled, observes."""
+def observed_by(
+    keyframe_id: int, map_reader: MapReader, label_views: Mapping[int, LabelView]
+) -> Observed | None:
+    """The landmarks of the map that a keyframe, which may be culled, or a label view observes."""
     world = map_reader.world
     keyframe = world.keyframes.get(keyframe_id)
     if keyframe is not None:
         rows, ids = world.observed(keyframe)
         return Observed(keyframe.features.image_pixels[rows], ids, keyframe, np.eye(4))
-    culled = world.culled.get(keyframe_id)
-    parent_id, T_parent_keyframe = map_reader.history.parent(keyframe_id)
-    parent = world.keyframes.get(parent_id)
-    if culled is None or parent is None:
+    view, own_id, T_own_camera = label_views.get(keyframe_id), keyframe_id, np.eye(4)
+    if view is not None:
+        own_id, T_own_camera = view.parent_id, view.T_parent_camera
+    parent_id, T_parent_own = map_reader.history.parent(own_id)
+    seen, parent = view or world.culled.get(keyframe_id), world.keyframes.get(parent_id)
+    if seen is None or parent is None:
         return None
-    rows = np.flatnonzero(culled.landmark_ids >= 0)
-    ids = world.landmarks.current(culled.landmark_ids[rows])
+    there = (seen.landmark_ids >= 0) & (seen.landmark_ids < len(world.landmarks))
+    rows = np.flatnonzero(there)
+    ids = world.landmarks.current(seen.landmark_ids[rows])
     existing = world.landmarks.in_map[ids]
-    return Observed(culled.image_pixels[rows[existing]], ids[existing], parent, T_parent_keyframe)
+    pixels = seen.image_pixels[rows[existing]]
+    return Observed(pixels, ids[existing], parent, T_parent_own @ T_own_camera)

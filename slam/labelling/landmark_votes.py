@@ -8,6 +8,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask, step_of
 from bmask_slam.graph.camera import Camera
+from bmask_slam.labelling.label_views import LabelViews
 from bmask_slam.labelling.landmark_visibility import (
     Observed,
     Sightings,
@@ -50,9 +51,10 @@ class LabelVotes:
         map_reader: MapReader,
         labels: LabelStore,
         surfaces: SurfaceStore,
+        label_views: LabelViews,
     ) -> None:
         self._camera, self._config, self._map = camera, config, map_reader
-        self._labels, self._surfaces = labels, surfaces
+        self._labels, self._surfaces, self._label_views = labels, surfaces, label_views
         self._remembered = RememberedMasks(labels.classes)
 
     def vote(
@@ -90,7 +92,8 @@ class LabelVotes:
         poses, segments = np.tile(np.eye(4), (len(rows), 1, 1)), np.full(len(rows), _NOWHERE)
         matched = []
         for keyframe_id, row in self._remembered.rows.items():
-            if (seen := observed_by(keyframe_id, self._map)) is None:
+            seen = observed_by(keyframe_id, self._map, self._label_views)
+            if seen is None:
                 continue
             poses[row], segments[row] = seen.T_world_camera, seen.anchor.segment
             seen = seen.among(new)

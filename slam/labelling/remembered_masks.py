@@ -61,8 +61,8 @@ class RememberedMasks:
     ) -> None:
         row = len(self.rows)
         if row == REMEMBERED:
-            oldest = min([keyframe_id, *self.rows])
-            if oldest == keyframe_id:
+            oldest = next(iter(self.rows), None)
+            if oldest is None:
                 return
             row = self.rows.pop(oldest)
         if not self._images:

@@ -55,7 +55,7 @@ class WorldDelta:
         ids: (R,) valid landmarks of which another column changed.
         columns: the rows of these, by the name of the column.
         replaced_by: (size,) of all landmarks if any was fused, else None.
-        next_keyframe_id: of the map.
+        next_keyframe_id, label_views: of the map.
         keyframe_ids: (K,) of all keyframes.
         poses: (K, 4, 4) T_world_camera.
         segments: (K,) map segments.
@@ -71,6 +71,7 @@ class WorldDelta:
     columns: Arrays
     replaced_by: Ints | None
     next_keyframe_id: int
+    label_views: int
     keyframe_ids: Ints
     poses: Array
     segments: Ints
@@ -121,6 +122,7 @@ class DeltaMaker:
             columns={name: getattr(table, name)[ids] for name in COLUMNS},
             replaced_by=replaced_by,
             next_keyframe_id=world.next_keyframe_id,
+            label_views=world.label_views,
             keyframe_ids=np.array([k.id for k in keyframes], np.int64),
             poses=np.array([k.T_world_camera for k in keyframes], float).reshape(-1, 4, 4),
             segments=np.array([k.segment for k in keyframes], np.int64),
@@ -224,6 +226,7 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
         keyframe.segment = segments[keyframe.id]
     world.set_keyframes(kept | {k.id: k for k in pending})
     world.next_keyframe_id = max(world.next_keyframe_id, delta.next_keyframe_id)
+    world.label_views = max(world.label_views, delta.label_views)
     history.take_back(kept)
     for keyframe_id, (parent, T_parent_culled) in delta.parents.items():
         history.hand_over(keyframe_id, parent, T_parent_culled)

@@ -17,6 +17,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.own_factors import own_factor, text_of
 from bmask_slam.graph.files.array_file import nested, read_arrays
 from bmask_slam.graph.sensors.streams import Measurements
+from bmask_slam.labelling.label_views import LabelView
 from bmask_slam.labelling.results import LandmarkLabels
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.live.messages import STATE_FILE, ChangeOwnFactors, ImageToSegment, Masks, UseCamera
@@ -273,14 +274,25 @@ class _RemoteSemantics(SemanticMapper):
 
     def observe(self, frame: Frame, keyframe: Keyframe, urgent: bool = False) -> None:
         """Send the requests; does not wait for answers."""
-        segmenter = self._system.segmenter
-        if segmenter is not None:
+        if (segmenter := self._system.segmenter) is not None:
+            self._segments(keyframe)
             segmenter.request(ImageToSegment(keyframe.id, frame.rgb, frame.name))
             if urgent:
                 begins = self._system.map.world.is_alone(keyframe)
                 segmenter.hurry(keyframe.id, BEGINNING_S if begins else 0.0)
         if self._system.dense is not None:
             self._system.dense.add_keyframe(keyframe.id, frame)
+
+    @property
+    def _takes_views(self) -> bool:
+        """Whether the segmenter waits for work, and the map grows."""
+        segmenter, remote = self._system.segmenter, self._system.remote
+        return segmenter is not None and not segmenter.waiting and remote.extends
+
+    def _request(self, frame: Frame, view: LabelView) -> None:
+        self._system.remote.send(view)
+        if (segmenter := self._system.segmenter) is not None:
+            segmenter.request(ImageToSegment(view.number, frame.rgb, frame.name))
 
     def landmark_labels(self, ids: Ints, keyframes: Sequence[Keyframe]) -> LandmarkLabels | None:
         """None: the map's process has them."""

@@ -25,6 +25,7 @@ from bmask_slam.graph.factors.graph_update import (
     site_id,
 )
 from bmask_slam.graph.files.array_file import part
+from bmask_slam.labelling.label_views import FIRST_LABEL_VIEW
 from bmask_slam.sensing.reference_frame import RETIRED_FRAME
 from bmask_slam.sensing.sensor_fusion import KINDS
 
@@ -37,7 +38,7 @@ class Shift:
     """What is added to the ids, frame indices and stamps of one run.
 
     Attributes:
-        keyframes, landmarks, segments, objects: to ids.
+        keyframes, landmarks, segments, objects, label_views: to ids.
         frames: to indices in the recording.
         stamp_s: to stamps, in whole seconds.
     """
@@ -48,10 +49,12 @@ class Shift:
     objects: int = 0
     frames: int = 0
     stamp_s: float = 0.0
+    label_views: int = 0
 
     def keyframe(self, ids: Ints) -> Ints:
-        """Ids of keyframes; -1 stays."""
-        return np.where(ids >= 0, ids + self.keyframes, ids)
+        """Ids of keyframes and numbers of label views; -1 stays."""
+        added = np.where(ids < FIRST_LABEL_VIEW, self.keyframes, self.label_views)
+        return np.where(ids >= 0, ids + added, ids)
 
     def landmark(self, ids: Ints) -> Ints:
         """Ids of landmarks; -1 stays."""
@@ -96,6 +99,7 @@ class Shift:
             self.objects + int(state["semantics.objects.points.next_id"]),
             frames,
             stamp_s,
+            self.label_views + int(state["mapper.world.label_views"]),
         )
 
 
@@ -124,12 +128,14 @@ _KEYFRAMES = (
     *(f"{_WORLD}landmarks.{name}" for name in ("host", "last_keyframe")),
     *(f"{_HISTORY}{name}" for name in ("keyframe_ids", "culled_ids", "heir_ids")),
     *(f"semantics.{name}" for name in ("done", "waiting", "votes.keyframes", "upright.keyframes")),
+    *("semantics.views.numbers", "semantics.views.parents"),
     *("semantics.objects.points.anchors", "mapper.loops.closed"),
 )
 _LANDMARKS = (
     *(f"{_WORLD}{name}" for name in ("landmarks.ids", "culled.landmark_ids")),
     *(f"{_WORLD}keypoints.{name}" for name in ("landmark_ids", "sent_ids")),
     *("semantics.labels.ids", "semantics.surfaces.ids", "dynamics.movability.ids"),
+    "semantics.views.landmark_ids",
 )
 _CHANGES: dict[str, _Change] = {
     **dict.fromkeys(_KEYFRAMES, Shift.keyframe),
@@ -140,7 +146,7 @@ _CHANGES: dict[str, _Change] = {
     **dict.fromkeys(
         (
             *(f"{_WORLD}keyframes.timestamp_s", f"{_HISTORY}timestamps_s"),
-            *("semantics.waiting_s", f"{_OBJECTS}points.seen_s"),
+            *("semantics.waiting_s", "semantics.views.stamps_s", f"{_OBJECTS}points.seen_s"),
         ),
         Shift.stamp,
     ),
@@ -149,7 +155,10 @@ _CHANGES: dict[str, _Change] = {
     **dict.fromkeys((f"{_OBJECTS}merging", f"{_OBJECTS}splitting"), _evidence),
 }
 """What is done to the arrays of a run that hold ids, indices or stamps; others stay as they are."""
-_SUMS = (f"{_WORLD}next_keyframe_id", f"{_WORLD}landmarks.size", f"{_OBJECTS}points.next_id")
+_SUMS = (
+    *(f"{_WORLD}{name}" for name in ("next_keyframe_id", "label_views", "landmarks.size")),
+    f"{_OBJECTS}points.next_id",
+)
 _COMMON = ("semantics.names", "semantics.measured", "semantics.surfaces.names")
 _SIZE, _CODED = "dynamics.movability.size", "semantics.votes.coded"
 _PARTS = (_WORLD, _HISTORY, "mapper.loops.closed", "mapper.loops.believed", "dynamics.movability.")

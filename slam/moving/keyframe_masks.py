@@ -21,7 +21,10 @@ class KeyframeMasks:
     """A keyframe's instances, and the landmarks that lie on them.
 
     Attributes:
-        keyframe_id: of the keyframe.
+        keyframe_id: of the keyframe, or the number of a label view.
+        timestamp_s: of its frame, NaN if not known.
+        anchor_id, T_anchor_camera: a keyframe of the map, itself if it is one, and its pose (4, 4)
+            relative to that.
         names: the label set.
         assignment: the instance of every pixel.
         depth_m: (H / s, W / s) every s-th pixel of the depth image, NaN where missing.
@@ -32,6 +35,9 @@ class KeyframeMasks:
     """
 
     keyframe_id: int
+    timestamp_s: float
+    anchor_id: int
+    T_anchor_camera: Array
     names: LabelSet
     assignment: PixelAssignment
     depth_m: Floats
@@ -39,6 +45,11 @@ class KeyframeMasks:
     landmark_ids: Ints
     instances: Ints
     label_distributions: Array
+
+    @property
+    def of_keyframe(self) -> bool:
+        """Whether they are of a keyframe of the map."""
+        return self.keyframe_id == self.anchor_id
 
     @property
     def step(self) -> int:

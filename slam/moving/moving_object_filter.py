@@ -157,13 +157,13 @@ class MovingObjectFilter:
         """Use a keyframe's masks, now or late: observations on moving things are removed."""
         if not self.config.labels:
             return
-        keyframe = self._map.world.keyframes.get(masks.keyframe_id)
+        anchor = self._map.world.keyframes.get(masks.anchor_id)
         views: list[PosedView] = []
         recent: list[PosedView] = []
-        if keyframe is not None and self.config.geometry:
-            views = self.keyframe_views.posed(keyframe.segment, self._map)
-            recent = self.recent_views.posed(keyframe.segment, self._map)
-        now_s = np.nan if keyframe is None else keyframe.timestamp_s
+        if anchor is not None and self.config.geometry:
+            views = self.keyframe_views.posed(anchor.segment, self._map)
+            recent = self.recent_views.posed(anchor.segment, self._map)
+        now_s = np.nan if anchor is None else masks.timestamp_s
         visible_surfaces = surfaces(
             self.camera, masks, self.config.check.window_px, self.config.min_judged
         )
@@ -183,10 +183,11 @@ class MovingObjectFilter:
             return
         moves = np.isin(masks.assignment.owner, np.flatnonzero(moving))
         self.keyframe_views.clear_depth(masks.keyframe_id, moves)
-        if keyframe is not None and self.config.geometry:
+        if anchor is not None and self.config.geometry:
             by_class = [t if _by_class(t) else None for t in tracks]
             self.static_verification.add(masks, visible_surfaces, by_class, self._map.world)
-        self._map.prune_mask(masks.keyframe_id, moves, self.config.mask_border_px)
+        if masks.of_keyframe:
+            self._map.prune_mask(masks.keyframe_id, moves, self.config.mask_border_px)
         self.landmarks.remove_moving(masks.landmark_ids)
 
     def begin_session(self) -> None:
@@ -265,8 +266,8 @@ class MovingObjectFilter:
     ) -> tuple[Mask, list[Track | None]]:
         """Which of a keyframe's sightings (K,) move, by their tracks, if they have one; these.
 
-        A culled keyframe, whose time ``now_s`` is NaN, adds nothing to the tracks, nor does one
-        whose masks come after those of a newer one: its process may have been started again.
+        Masks whose time ``now_s`` is not known add nothing to the tracks, nor do those that come
+        after newer ones: their process may have been started again.
         """
         moving = np.array([s is not None and s.log_odds > 0 for s in sightings], bool)
         tracks: list[Track | None] = [None] * len(sightings)

@@ -83,7 +83,8 @@ class PendingMovable:
 
     Attributes:
         track_id: of its track, which may have ended.
-        keyframe_id, time_s: of the keyframe that saw it first.
+        keyframe_id: of the keyframe that saw it first, or that a label view which did is near.
+        time_s: when it was seen first.
         points: (N, 3) on its surface, m, in the keyframe's camera frame.
         removed: what was removed for it, from this and later keyframes.
         static_views, moved_views: number of later frames that found it in place, and that did not.
@@ -126,23 +127,24 @@ class StaticVerification:
         """
         if self.config.stands_s == 0:
             return
-        keyframe = world.keyframes[masks.keyframe_id]
+        anchor = world.keyframes[masks.anchor_id]
         for k, (surface, track) in enumerate(zip(observed_surfaces, tracks, strict=True)):
             if surface is None or track is None:
                 continue
             mask = masks.assignment.owner == k
-            removed = _about_to_be_removed(mask, keyframe, world.landmarks, self._border_px)
-            points = surface.points[surface.complete]
-            pending = PendingMovable(
-                track.id, keyframe.id, keyframe.timestamp_s, points, (removed,)
-            )
+            removed: tuple[Removed, ...] = ()
+            if masks.of_keyframe:
+                own = _about_to_be_removed(mask, anchor, world.landmarks, self._border_px)
+                removed = (own,)
+            points = transform(masks.T_anchor_camera, surface.points[surface.complete])
+            pending = PendingMovable(track.id, anchor.id, masks.timestamp_s, points, removed)
             before = [
                 s
                 for s in self.pending
                 if s.track_id == track.id and s.moved_views <= s.static_views
             ]
             if before:
-                pending = replace(before[0], removed=(*before[0].removed, removed))
+                pending = replace(before[0], removed=(*before[0].removed, *removed))
             self.pending = [s for s in self.pending if s.track_id != track.id] + [pending]
 
     def stood(

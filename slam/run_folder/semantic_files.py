@@ -17,6 +17,7 @@ from bmask_slam.graph.errors import MAX_WHOLE, InputError, finite_number, whole_
 from bmask_slam.graph.files.json_file import STRICT, Name, read_json
 from bmask_slam.graph.files.reading import read_table
 from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.labelling.label_views import FIRST_LABEL_VIEW
 from bmask_slam.labelling.results import LandmarkCloud, MapObjects
 from bmask_slam.run_folder.object_picture import draw_objects
 from bmask_slam.semantics.instances.overlay import class_colour
@@ -214,7 +215,7 @@ def _as_json(o: MapObject, found: MapObjects) -> dict[str, Any]:
             "axes_world": [_rounded(axis) for axis in o.box.T_world_box[:3, :3].T],
             "size_m": _rounded(o.box.size_m),
         },
-        "keyframes": o.keyframe_ids.tolist(),
+        "keyframes": o.keyframe_ids[o.keyframe_ids < FIRST_LABEL_VIEW].tolist(),
         "landmarks": o.landmark_ids.tolist(),
         "first_seen_s": round(o.first_seen_s, 6),
         "last_seen_s": round(o.last_seen_s, 6),

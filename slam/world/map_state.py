@@ -53,6 +53,7 @@ def world_state(world: WorldMap) -> Arrays:
     rows["keypoints"] = np.array([len(f) for f in features], np.int64)
     return {
         "next_keyframe_id": np.array(world.next_keyframe_id),
+        "label_views": np.array(world.label_views),
         **nested(
             landmarks=world.landmarks.state(),
             keyframes=rows,
@@ -87,7 +88,8 @@ def world_of(state: Arrays) -> WorldMap:
     if keypoints["landmark_ids"].max(initial=-1) >= len(landmarks.host):
         raise ValueError("a keypoint on a landmark that is not there")
     culled = _culled_of(part(state, "culled"))
-    world = WorldMap(keyframes, landmarks, int(state["next_keyframe_id"]), culled)
+    counts = int(state["next_keyframe_id"]), culled, int(state.get("label_views", 0))
+    world = WorldMap(keyframes, landmarks, *counts)
     for keyframe in keyframes.values():
         world.store_features(keyframe)
     return world

@@ -23,12 +23,10 @@ _COLUMNS = [f.name for f in fields(Features) if f.name != "gray"]
 
 @dataclass
 class WorldMap:
-    """Keyframes by id, in the order they were made, and the landmark table.
-
-    Observations change by methods of the map alone, since it keeps an index of them.
+    """Keyframes by id, as they were made, and the landmark table, which methods alone change.
 
     Attributes:
-        culled: the keyframes that were culled last.
+        culled: the keyframes that were culled last. label_views: number of those ever made.
         changed: ids of keyframes whose observations changed; who sends them to the graph clears it.
     """
 
@@ -36,6 +34,7 @@ class WorldMap:
     landmarks: LandmarkTable = field(default_factory=LandmarkTable)
     next_keyframe_id: int = 0
     culled: dict[int, CulledKeyframe] = field(default_factory=dict)
+    label_views: int = 0
     changed: set[int] = field(default_factory=set, repr=False, compare=False)
     _observers: Observers = field(default_factory=Observers, repr=False, compare=False)
     _disk: DiskRecords = field(default_factory=DiskRecords, repr=False, compare=False)

@@ -23,6 +23,7 @@ from bmask_slam.graph.files.disk_arrays import DiskRows
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.graph.smoother.storage import graph_arrays
 from bmask_slam.labelling.awaited_masks import kept_depth
+from bmask_slam.labelling.label_views import FIRST_LABEL_VIEW, LabelView
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.moving.static_verification import PendingMovable, Removed
 from bmask_slam.semantics.instances.instances import Instance, PackedMask, certain, mask_box
@@ -105,6 +106,10 @@ def system() -> SlamSystem:
     system.semantics.await_masks(
         system.mapper.world.keyframes[first], kept_depth(FRAMES[3].depth_m)
     )
+    seen = np.arange(8.0).reshape(4, 2), np.arange(4), kept_depth(FRAMES[5].depth_m)
+    for number, keyframe_id in enumerate((first, second), FIRST_LABEL_VIEW + 2):
+        view = LabelView(number, 0.1 * number, keyframe_id, np.eye(4), *seen)
+        system.semantics.await_view(view)
     sighting = Sighting(np.array([0.1, 0, 2]), np.full(3, 0.2), certain(1, 3), 1.0)
     system.moving_objects.tracks.update(FRAMES[19].timestamp_s, [sighting])
     removed = [
@@ -229,7 +234,7 @@ def test_a_state_without_objects_or_what_is_newer_is_restored(system: SlamSystem
     objects = {n: a for n, a in none.items() if n.startswith("semantics.objects.")}
     assert restored({**state, **objects}).semantics.objects.state().keys()
     older = {n: a for n, a in state.items() if not n.endswith(OPTIONAL_ARRAYS)}
-    assert len(older) == len(state) - 15
+    assert len(older) == len(state) - 16
     twin = restored(older)
     of_file = world_of(part(older, "mapper.world"))  # as `map` and `optimise` read it
     assert of_file.keyframes.keys() == twin.map.world.keyframes.keys()

@@ -23,6 +23,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import read_arrays, write_arrays
 from bmask_slam.graph.geometry import carried_along
 from bmask_slam.graph.smoother.storage import read_camera
+from bmask_slam.labelling.label_views import LabelView
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import (
@@ -116,8 +117,8 @@ class MapServer:
                 self.add_keyframe(number, message)
             case LostKeyframe():
                 self.skip_keyframe(message)
-            case Masks():
-                self.add_masks(message)
+            case LabelView() | Masks():
+                self.label(message)
             case PruneLandmarks() | PruneMask() | RestoreObservations():
                 self.change_observations(message)
             case UseCamera():
@@ -217,8 +218,7 @@ class MapServer:
         system = self.system
         if not self._has_reference(message):
             history, landmarks = message.history, message.reserved[1]
-            lost = LostKeyframe(message.id, NO_KEYFRAME, np.eye(4), history, landmarks)
-            self.skip_keyframe(lost)
+            self.skip_keyframe(LostKeyframe(message.id, NO_KEYFRAME, np.eye(4), history, landmarks))
             return
         system.mapper.world.landmarks.reserve(*message.reserved, message.tracked.new_ids)
         self._add_frames(message)
@@ -236,8 +236,7 @@ class MapServer:
         system.mapper.close_loops(keyframe)
         if system.semantics.enabled:
             system.semantics.follow_map()
-        elapsed_ms = 1e3 * (time.perf_counter() - started_s)
-        self.send_changes(message.id, done=True, update_ms=elapsed_ms)
+        self.send_changes(message.id, done=True, update_ms=1e3 * (time.perf_counter() - started_s))
 
     def skip_keyframe(self, message: LostKeyframe) -> None:
         """Skip a keyframe; its frames are attached to its parent."""
@@ -254,8 +253,11 @@ class MapServer:
         reference, history = message.reference, self.system.mapper.history
         return reference is None or history.parent(reference[0])[0] != NO_KEYFRAME
 
-    def add_masks(self, message: Masks) -> None:
-        """Use a keyframe's masks; those that cannot be used are skipped."""
+    def label(self, message: LabelView | Masks) -> None:
+        """Await a label view's masks, or use masks; those that cannot be used are skipped."""
+        if isinstance(message, LabelView):
+            self.system.semantics.await_view(message)
+            return
         try:
             self.system.semantics.attach(message.keyframe_id, message.instances)
         except InputError as error:
@@ -265,8 +267,7 @@ class MapServer:
         """Send what changed in the map."""
         mapper = self.system.mapper
         delta = self._deltas.delta(mapper.world, mapper.history)
-        loops = len(mapper.loops.closed)
-        newest = mapper.sensors.newest
+        loops, newest = len(mapper.loops.closed), mapper.sensors.newest
         self._send(MapChanged(keyframe_id, delta, done, update_ms, loops, newest))
 
     def _add_frames(self, message: NewKeyframe | FramesTracked) -> None:

@@ -15,11 +15,13 @@ from bmask_slam.graph.files.array_file import read_arrays
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.graph.smoother.storage import read_camera
+from bmask_slam.labelling.label_views import FIRST_LABEL_VIEW, LabelView
 from bmask_slam.live.messages import (
     STATE_FILE,
     Handled,
     LostKeyframe,
     MapChanged,
+    Masks,
     NewKeyframe,
     PruneMask,
     RestoreObservations,
@@ -33,7 +35,9 @@ from bmask_slam.live.processes import map_worker
 from bmask_slam.live.processes.map_process import MapServer
 from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.processes.remote_mapper import MAX_UNSAVED, RemoteMapper
-from bmask_slam.semantics.instances.instances import PackedMask
+from bmask_slam.semantics.instances.instances import Instance, PackedMask, certain, mask_box
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.segmenters.segmenter_table import LabelsOnly, SegmenterOptions
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import starting
@@ -88,6 +92,26 @@ def test_a_segment_restarts_after_losing_its_first_keyframe() -> None:
     assert parents == {0: NO_KEYFRAME, 1: NO_KEYFRAME}
     trajectory = system.trajectory()
     assert trajectory.timestamps_s.tolist() == [2 / 30]  # those of the lost ones have no pose
+
+
+def test_masks_of_a_frame_that_is_no_keyframe_label_the_map() -> None:
+    answers: list[Any] = []
+    names = label_set(("wall",))
+    system = SlamSystem(CAMERA, segmenter=LabelsOnly(names.names, SegmenterOptions("none")))
+    server = MapServer(system, answers.append)
+    made = keyframe(system, 0, None)
+    server.handle(1, made)
+    seen = made.tracked.features.image_pixels, made.tracked.new_ids
+    number, wall = FIRST_LABEL_VIEW + 4, np.ones((CAMERA.height, CAMERA.width), bool)
+    server.handle(2, LabelView(number, 0.1, 0, np.eye(4), *seen, made.depth_m))
+    mask = Instance(wall, mask_box(wall), 1, certain(1, 2, 0.9), 0.9, 0.9)
+    server.handle(3, Masks(number, [mask]))
+    world = system.mapper.world
+    assert len(system.semantics.labels.known()) == world.landmarks.in_map.sum() > 100
+    assert world.label_views == 5
+    deltas = [answer.delta for answer in answers if isinstance(answer, MapChanged)]
+    server.send_changes(-1, done=False)
+    assert answers[-1].delta.label_views == 5 > deltas[-1].label_views
 
 
 def test_observations_removed_under_a_mask_are_restored() -> None:

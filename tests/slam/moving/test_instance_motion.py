@@ -33,7 +33,8 @@ def masks(depth_m: Floats) -> KeyframeMasks:
     """Masks of a keyframe with depth at every fourth pixel and without instances."""
     assignment = assign_pixels([], depth_m, SIZE, VoteConfig())
     none = np.zeros(0, np.int64)
-    return KeyframeMasks(3, NAMES, assignment, depth_m, POSE, none, none, np.zeros((0, 2)))
+    here = 3, 0.0, 3, np.eye(4)
+    return KeyframeMasks(*here, NAMES, assignment, depth_m, POSE, none, none, np.zeros((0, 2)))
 
 
 def track(centre: Array) -> Track:

@@ -277,6 +277,26 @@ def test_a_late_mask_removes_added_observations(frames: list[Frame]) -> None:
     assert len(system.mapper.smoother.estimate().landmark_ids) < in_graph
 
 
+@pytest.mark.parametrize("longest_s", [1.0, 0.0])
+def test_a_person_who_enters_a_known_view_is_found_by_masks(longest_s: float) -> None:
+    """By those of frames that are no keyframes, since none is made any more."""
+    settings = [
+        *("keyframes.min_interval_frames=100", "keyframes.urgent_shared=0.0"),
+        *(f"semantics.label_views.max_interval_s={longest_s}", "moving_objects.geometry=false"),
+    ]
+    segmenter = CardSegmenter(1)
+    person, segmenter.segment = segmenter.segment, lambda *_: []  # type: ignore[method-assign]
+    config = resolve(SystemConfig, None, [*SETTINGS, *settings])
+    system = SlamSystem(CAMERA, config, segmenter)
+    results = []
+    for k in range(24):
+        if k == 8:
+            segmenter.segment = person  # type: ignore[method-assign]
+        results.append(system.process(view(k, with_card=k >= 8)))
+    assert [r.keyframe_id for r in results] == [0] + 23 * [None]
+    assert (results[-1].ignored > 50) is (longest_s > 0)
+
+
 def test_masks_that_come_again_after_newer_ones_are_used(frames: list[Frame]) -> None:
     """A segmentation process that was started again repeats what it had not confirmed."""
     system = SlamSystem(CAMERA, resolve(SystemConfig, None, SETTINGS), CardSegmenter(1))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from synthetic_view import CAMERA
 
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Arrays
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.labelling.label_views import FIRST_LABEL_VIEW
 from bmask_slam.moving.depth_view_buffer import PosedView
 from bmask_slam.moving.free_space_check import FreeSpaceCheck, FreeSpaceCheckConfig, depth_view
 from bmask_slam.moving.keyframe_masks import KeyframeMasks, surfaces
@@ -40,9 +44,8 @@ def masks_of(left: int = LEFT, keyframe_id: int = 0) -> KeyframeMasks:
     thinned = depth(left)[::2, ::2].copy()
     assignment = assign_pixels([body], thinned, mask.shape, VoteConfig())
     none = np.zeros(0, np.int64)
-    return KeyframeMasks(
-        keyframe_id, NAMES, assignment, thinned, np.eye(4), none, none, np.eye(2)[:0]
-    )
+    here = keyframe_id, keyframe(keyframe_id).timestamp_s, keyframe_id, np.eye(4)
+    return KeyframeMasks(*here, NAMES, assignment, thinned, np.eye(4), none, none, np.eye(2)[:0])
 
 
 def keyframe(keyframe_id: int = 0) -> Keyframe:
@@ -102,6 +105,17 @@ def test_a_static_instance_is_verified_after_a_while() -> None:
     static_verification, world = watching()
     assert verified(static_verification, world, [depth()] * 30) == [13]  # 0.4 s and two frames more
     assert static_verification.pending == []
+
+
+def test_an_instance_of_a_label_view_is_verified_where_that_saw_it() -> None:
+    """The keyframe that it is near was elsewhere, and has no observations of it to restore."""
+    static_verification, world = StaticVerification(CHECK, CONFIG, 20, 5), WorldMap()
+    world.add_keyframe(replace(keyframe(), T_world_camera=se3_exp(np.array([0, 0, 0, -1.0, 0, 0]))))
+    T_anchor_camera = se3_exp(np.array([0, 0, 0, 1.0, 0, 0]))
+    view = replace(masks_of(), keyframe_id=FIRST_LABEL_VIEW, T_anchor_camera=T_anchor_camera)
+    add(static_verification, world, view, track())
+    assert static_verification.pending[0].removed == ()
+    assert verified(static_verification, world, [depth()] * 30) == [13]
 
 
 @pytest.mark.parametrize(
