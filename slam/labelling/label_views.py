@@ -29,6 +29,13 @@ _NEVER = -np.inf
 _NO_DEPTH = np.zeros((0, 0), np.float32)
 
 
+def described(number: int) -> str:
+    """What has this number: a keyframe or a label view."""
+    if number < FIRST_LABEL_VIEW:
+        return f"keyframe {number}"
+    return f"label view {number - FIRST_LABEL_VIEW}"
+
+
 @dataclass(frozen=True)
 class LabelViewConfig:
     """When a frame that is no keyframe is segmented.

@@ -14,7 +14,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.labelling.awaited_masks import DEPTH_STEP, AwaitingKeyframe, AwaitingKeyframes
 from bmask_slam.labelling.config import SemanticsConfig, above
-from bmask_slam.labelling.label_views import FIRST_LABEL_VIEW, LabelView, LabelViews
+from bmask_slam.labelling.label_views import FIRST_LABEL_VIEW, LabelView, LabelViews, described
 from bmask_slam.labelling.landmark_visibility import Observed, observed_by
 from bmask_slam.labelling.landmark_votes import LabelVotes
 from bmask_slam.labelling.results import (
@@ -94,12 +94,12 @@ class LabelledMap:
         Raises:
             InputError: masks of another size or with labels that are not in the label set.
         """
-        check_instances(instances, self._size, self.names, f"keyframe {keyframe_id}")
+        check_instances(instances, self._size, self.names, described(keyframe_id))
         observed = observed_by(keyframe_id, self._map, self._label_views)
         done = keyframe_id in self._done
         if observed is None or done:
             refused = "it has its masks already" if done else "it is not in the map"
-            logger.info("masks of keyframe %d are not used: %s", keyframe_id, refused)
+            logger.info("masks of %s are not used: %s", described(keyframe_id), refused)
             return Attachment(keyframe_id, len(instances), refused=refused)
         self._done.add(keyframe_id)
         self._gravity.use_side(up_of(instances))

@@ -9,7 +9,12 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.labelling.awaited_masks import MaskRequests, kept_depth
 from bmask_slam.labelling.config import SemanticsConfig
-from bmask_slam.labelling.label_views import FIRST_LABEL_VIEW, LabelView, LabelViewDecision
+from bmask_slam.labelling.label_views import (
+    FIRST_LABEL_VIEW,
+    LabelView,
+    LabelViewDecision,
+    described,
+)
 from bmask_slam.labelling.labelled_map import LabelledMap
 from bmask_slam.moving.keyframe_masks import KeyframeMasks
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter, Segmenter, begin_early
@@ -106,7 +111,7 @@ class SemanticMapper(LabelledMap):
                     raise
                 of_view = asked.keyframe_id >= FIRST_LABEL_VIEW
                 level = logging.INFO if of_view else logging.WARNING
-                logger.log(level, "keyframe %d has no masks: %s", asked.keyframe_id, error)
+                logger.log(level, "%s has no masks: %s", described(asked.keyframe_id), error)
 
     def begin_session(self) -> None:
         """Another recording begins: masks of earlier keyframes are not awaited."""

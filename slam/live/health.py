@@ -31,11 +31,11 @@ class Health:
         submaps: in the dense map.
         surface_frames: in its surface besides keyframes.
         keyframes_waiting: for the map's process.
-        masks_waiting: keyframes that wait for the segmenter's process.
+        masks_waiting: images that wait for the segmenter's process.
         submaps_waiting: keyframes that wait for the dense map's process.
         frames_dropped: by the source, because tracking was busy.
         frames_refused: that were broken, or not later than the one before.
-        masks_dropped: keyframes that the segmenter skipped.
+        masks_dropped: images that the segmenter skipped.
         submaps_dropped: keyframes that the dense map skipped.
         surface_frames_dropped: that were due for the surface while it was behind.
         unwritten: how often something could not be written, as on a full disk.

@@ -23,7 +23,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import read_arrays, write_arrays
 from bmask_slam.graph.geometry import carried_along
 from bmask_slam.graph.smoother.storage import read_camera
-from bmask_slam.labelling.label_views import LabelView
+from bmask_slam.labelling.label_views import LabelView, described
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import (
@@ -261,7 +261,7 @@ class MapServer:
         try:
             self.system.semantics.attach(message.keyframe_id, message.instances)
         except InputError as error:
-            logger.warning("keyframe %d has no masks: %s", message.keyframe_id, error)
+            logger.warning("%s has no masks: %s", described(message.keyframe_id), error)
 
     def send_changes(self, keyframe_id: int, done: bool, update_ms: float = 0.0) -> None:
         """Send what changed in the map."""
