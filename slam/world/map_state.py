@@ -15,6 +15,8 @@ from bmask_slam.world.keyframe import CulledKeyframe, Keyframe
 from bmask_slam.world.landmark_table import LandmarkTable
 from bmask_slam.world.world_map import WorldMap
 
+MAX_LABEL_VIEWS = 10**9
+"""No map has more: one in 0.2 s, for six years."""
 _Columns = dict[str, tuple[tuple[int, ...], type]]  # shape of a row, and its type
 _KEYFRAME: _Columns = {
     "id": ((), np.int64),
@@ -88,8 +90,10 @@ def world_of(state: Arrays) -> WorldMap:
     if keypoints["landmark_ids"].max(initial=-1) >= len(landmarks.host):
         raise ValueError("a keypoint on a landmark that is not there")
     culled = _culled_of(part(state, "culled"))
-    counts = int(state["next_keyframe_id"]), culled, int(state.get("label_views", 0))
-    world = WorldMap(keyframes, landmarks, *counts)
+    label_views = int(state.get("label_views", 0))
+    if not 0 <= label_views <= MAX_LABEL_VIEWS:
+        raise ValueError(f"{label_views} label views")
+    world = WorldMap(keyframes, landmarks, int(state["next_keyframe_id"]), culled, label_views)
     for keyframe in keyframes.values():
         world.store_features(keyframe)
     return world
