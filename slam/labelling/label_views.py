@@ -8,6 +8,7 @@ was, or some time has passed. Map and graph do not change by it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,8 @@ FIRST_LABEL_VIEW = 1 << 40
 """Label views are numbered from here on, so that no keyframe has the same number."""
 MAX_VIEWS = 200
 """Label views that are kept: their masks come late, and vote on landmarks that are made later."""
+MAX_RESENT = 20
+"""Messages of label views that a new process of the map gets again."""
 MIN_COMMON = 10
 """An image has moved on if it has fewer landmarks in common with the other."""
 _NEVER = -np.inf
@@ -34,6 +37,24 @@ def described(number: int) -> str:
     if number < FIRST_LABEL_VIEW:
         return f"keyframe {number}"
     return f"label view {number - FIRST_LABEL_VIEW}"
+
+
+def forget_old_views(journal: dict[int, Any], newest: Any) -> None:
+    """Drop what concerns label views, but the last of it, from messages that may be sent again.
+
+    In a known room no keyframe comes, after which the map would be saved and they be dropped. With
+    depth images and masks they would fill the memory; labels do without.
+    """
+    if not _concerns_view(newest):
+        return
+    numbers = [number for number, message in journal.items() if _concerns_view(message)]
+    for number in numbers[:-MAX_RESENT]:
+        del journal[number]
+
+
+def _concerns_view(message: Any) -> bool:
+    number = message.number if isinstance(message, LabelView) else 0
+    return bool(getattr(message, "keyframe_id", number) >= FIRST_LABEL_VIEW)
 
 
 @dataclass(frozen=True)

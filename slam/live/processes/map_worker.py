@@ -1,6 +1,6 @@
 """Owner of the map process, which is restarted from a saved state and a journal if it dies.
 
-Messages are kept in the journal until the process has saved a state that contains them. If it dies,
+Messages are kept in a journal until the process has saved a state with them. If it dies,
 a new process starts from that state and gets the later messages again; tracking goes on meanwhile.
 On a workstation it is the same; states come back over the network. While that is away, at the start
 or later, the process is one of this machine, and then the map goes there (`map_return`).
@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.labelling.label_views import forget_old_views
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import Finish, Ready, Resent, SaveState, Started, StateSaved
 from bmask_slam.live.processes.map_process import serve_map
@@ -40,11 +41,9 @@ class MapWorker:
     """Sends numbered messages to the map's process, and restarts it when it dies.
 
     Attributes:
-        crashes: how often the process has died.
-        losses: how often the workstation was lost.
+        crashes, losses: how often the process has died, and how often the workstation was lost.
         state: the file of the last saved state, None before the first.
-        saves: how many states were saved.
-        saved: number of the last message that the last state contains.
+        saves, saved: how many states were saved; number of the last message in the last one.
         sent: the number of the last message.
     """
 
@@ -119,6 +118,7 @@ class MapWorker:
             self._return = None
         self.sent += 1
         self._journal[self.sent] = message
+        forget_old_views(self._journal, message)
         self._worker.send((self.sent, message))
 
     @property

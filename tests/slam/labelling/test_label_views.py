@@ -19,12 +19,15 @@ from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.labelling import label_views
 from bmask_slam.labelling.label_views import (
     FIRST_LABEL_VIEW,
+    MAX_RESENT,
     LabelView,
     LabelViewConfig,
     LabelViewDecision,
     LabelViews,
+    forget_old_views,
 )
 from bmask_slam.labelling.landmark_visibility import observed_by
+from bmask_slam.live.messages import Masks
 from bmask_slam.merging.joint_state import Shift
 from bmask_slam.run_folder.semantic_files import write_objects
 from bmask_slam.system import SlamSystem
@@ -138,6 +141,19 @@ def test_the_last_views_are_kept_without_their_depth(monkeypatch: pytest.MonkeyP
         assert list(kept) == [6, 8, 9]
         assert kept[8].depth_m.size == 0
         assert kept[8].image_pixels.tolist() == [[8.0, 8.0], [8.0, 8.0]]
+
+
+def test_only_the_last_messages_of_views_are_kept_to_be_sent_again() -> None:
+    journal: dict[int, Any] = {}
+    for k in range(100):
+        sent = Masks(k, []), view(FIRST_LABEL_VIEW + k), Masks(FIRST_LABEL_VIEW + k, [])
+        for message in sent:
+            journal[len(sent) * k + sent.index(message)] = message
+            forget_old_views(journal, message)
+    of_keyframes = [m for m in journal.values() if isinstance(m, Masks) and m.keyframe_id < 100]
+    assert len(of_keyframes) == 100
+    assert len(journal) == 100 + MAX_RESENT
+    assert list(journal)[-2:] == [298, 299]
 
 
 def tracked(moved_px: float, count: int = 40, status: str = "OK") -> Any:
