@@ -132,8 +132,7 @@ class LabelViews(dict[int, LabelView]):
         }
 
     def restore(self, state: Arrays) -> None:
-        """Go on from a state."""
-        self.clear()
+        """Go on from a state; there is nothing yet."""
         poses = state["T_parent_camera"].reshape(-1, 4, 4)
         rows = (split_rows(state[name], state["sizes"]) for name in ("pixels", "landmark_ids"))
         scalars = (state[name].tolist() for name in ("numbers", "stamps_s", "parents"))

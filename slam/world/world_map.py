@@ -23,10 +23,10 @@ _COLUMNS = [f.name for f in fields(Features) if f.name != "gray"]
 
 @dataclass
 class WorldMap:
-    """Keyframes by id, as they were made, and the landmark table, which methods alone change.
+    """Keyframes by id, in the order they were made, and the landmark table; methods change them.
 
     Attributes:
-        culled: the keyframes that were culled last. label_views: number of those ever made.
+        culled: the keyframes that were culled last. label_views: number of label views ever made.
         changed: ids of keyframes whose observations changed; who sends them to the graph clears it.
     """
 

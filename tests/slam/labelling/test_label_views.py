@@ -93,7 +93,7 @@ def test_masks_of_a_view_are_used_once_and_those_of_an_unknown_one_are_refused(
     assert unknown.refused == "it is not in the map"
 
 
-def test_a_view_of_a_culled_keyframe_is_where_it_was(viewed: SlamSystem) -> None:
+def test_a_view_of_a_culled_keyframe_is_where_it_was() -> None:
     system = run(Beside(), *ALL)
     world, history = system.map.world, system.map.history
     first, last = world.keyframes[min(world.keyframes)], world.keyframes[max(world.keyframes)]
