@@ -13,9 +13,9 @@ from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.labelling.config import SemanticsConfig
 from bmask_slam.loops.closing import LoopClosingConfig
 from bmask_slam.moving.config import MovingObjectConfig
+from bmask_slam.tracking.config import TrackingConfig
 from bmask_slam.tracking.keyframe_decision import KeyframeConfig
 from bmask_slam.tracking.relocalisation import RelocalisationConfig
-from bmask_slam.tracking.tracker import TrackingConfig
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,7 @@ ROOMS = {
     "slam/live": """[...]  ros2  sources  processes  network  system  start  health  display
                     recorder  live_map  live_slam  play""",
     "slam/live/sources": "[...]  cameras  opening",
+    "slam/tracking": "pose  [...]",
     "slam/comparison": "experiment  jobs  statistics  report  [...]",
 }
 MAX_MODULES, MAX_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS = 12, 300, 40, 6

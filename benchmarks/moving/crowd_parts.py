@@ -1,7 +1,8 @@
-"""Tracking among people: parts of Bonn's crowd, every frame of them or fewer, by default options.
+"""Tracking among people: parts of Bonn's crowd, every frame of them or fewer.
 
     python -m benchmarks.moving.crowd_parts [--how NAME ...] [--first N ...] [--stride N ...]
-                                            [--repeats N] [--core N] [--before FOLDER]
+                                            [--segmenter NAME] [--repeats N] [--core N]
+                                            [--before FOLDER]
 
 Where a recording begins, and how far its frames are apart, decides how much of the first images
 people fill and how far they walk between two frames. Each part is run with several grids of
@@ -74,7 +75,9 @@ def main() -> None:
     parser.add_argument("--how", nargs="*", choices=list(WAYS), default=["run"])
     parser.add_argument("--first", type=int, nargs="*", default=FIRST, metavar="N")
     parser.add_argument("--stride", type=int, nargs="*", default=STRIDES, metavar="N")
+    parser.add_argument("--segmenter", metavar="NAME")
     given, codes = repeats_of(parser)
+    masks = ["--segmenter", given.segmenter] if given.segmenter else []
     columns = [
         (f"{way}{when}", WAYS[way], code) for way in given.how for when, code in codes.items()
     ]
@@ -82,7 +85,7 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         for name, part, options in parts(given, Path(folder)):
             errors = (
-                ates_mm([way[0], str(part), *way[1:], *options], given.repeats, code)
+                ates_mm([way[0], str(part), *way[1:], *masks, *options], given.repeats, code)
                 for _, way, code in columns
             )
             rows.append((name, *(", ".join(f"{mm:.1f}" for mm in found) for found in errors)))

@@ -34,8 +34,9 @@ from bmask_slam.graph.arrays import Array, Bits, Ints
 from bmask_slam.graph.files.array_file import FileKind, write_arrays
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.tracking.config import TrackingConfig
 from bmask_slam.tracking.results import Tracked, TrackingStatus
-from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.local_map import local_landmarks
 

@@ -13,7 +13,7 @@ from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.loops.verification import LoopConstraint
-from bmask_slam.tracking.pose_optimisation import CHI2_2DOF, CHI2_3DOF, residuals
+from bmask_slam.tracking.pose.pose_optimisation import CHI2_2DOF, CHI2_3DOF, residuals
 from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.covisibility import MIN_SHARED
 from bmask_slam.world.frame_history import FrameHistory

@@ -15,15 +15,15 @@ from bmask_slam.features.brisk import Features, select
 from bmask_slam.graph.arrays import Array, Ints, no_ids
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
-from bmask_slam.tracking.pose_optimisation import optimise_pose
-from bmask_slam.tracking.results import Tracked
-from bmask_slam.tracking.rolling_shutter import (
+from bmask_slam.tracking.pose.pose_optimisation import optimise_pose
+from bmask_slam.tracking.pose.rolling_shutter import (
     CameraVelocity,
     PreviousPose,
     after_mean_row_s,
     at_one_moment,
     velocities,
 )
+from bmask_slam.tracking.results import Tracked
 from bmask_slam.world.frame_observations import FrameObservations
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap

@@ -10,7 +10,7 @@ from bmask_slam.features.matching import MatchConfig, match_brute_force
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
-from bmask_slam.tracking.pose_optimisation import CHI2_2DOF
+from bmask_slam.tracking.pose.pose_optimisation import CHI2_2DOF
 from bmask_slam.world.covisibility import MIN_SHARED
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap

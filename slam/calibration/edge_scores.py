@@ -19,7 +19,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.threads import in_threads
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices
 from bmask_slam.sequences.sequence import Sequence
-from bmask_slam.tracking.rolling_shutter import velocities
+from bmask_slam.tracking.pose.rolling_shutter import velocities
 
 FRAMES = 32
 RADIUS = 32

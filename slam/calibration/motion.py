@@ -12,7 +12,7 @@ from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.geometry import inverse, se3_log, transform
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices
 from bmask_slam.run_folder.map_file import SavedRun
-from bmask_slam.tracking.rolling_shutter import velocities
+from bmask_slam.tracking.pose.rolling_shutter import velocities
 
 MAX_LATE_S, MAX_GAP_S = 1e-3, 0.11
 MIN_DEPTH_M = 0.1

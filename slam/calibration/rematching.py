@@ -44,7 +44,7 @@ from bmask_slam.graph.calibration.problem import CalibrationProblem
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.run_folder.map_file import SavedRun
-from bmask_slam.tracking.rolling_shutter import velocities
+from bmask_slam.tracking.pose.rolling_shutter import velocities
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 

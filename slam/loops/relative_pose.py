@@ -10,7 +10,7 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import adjoint, inverse, orthonormalised, se3_exp
-from bmask_slam.tracking.pose_optimisation import CHI2_2DOF, CHI2_3DOF, jacobian, residuals
+from bmask_slam.tracking.pose.pose_optimisation import CHI2_2DOF, CHI2_3DOF, jacobian, residuals
 
 MAX_NOISE_SCALE = 3.0
 MEDIAN_TO_GATE = 2.366 / CHI2_3DOF  # of chi-square

@@ -46,8 +46,12 @@ class LandmarkMotion:
         self.movability.restore(state)
 
     def observe_frame(self, tracked: Tracked, view: DepthView | None) -> Ints:
-        """Update landmarks in view by a frame's depth; returns the ids of those that move."""
-        ids = tracked.visible_ids
+        """Update landmarks in view by a frame's depth; returns the ids of those that move.
+
+        What tracking found to move is evidence, too.
+        """
+        ids, power = tracked.visible_ids, self._config.frame_power
+        self.movability.update(tracked.moving_ids, np.ones(len(tracked.moving_ids), bool), power)
         if view is None or not len(ids):
             return ids[self.movability.moving(ids)]
         landmarks = self._map.world.landmarks
@@ -58,7 +62,7 @@ class LandmarkMotion:
         found = tracked_now[ids]
         removed &= ~found
         judged = found | removed
-        self.movability.update(ids[judged], removed[judged], self._config.frame_power)
+        self.movability.update(ids[judged], removed[judged], power)
         return ids[self.movability.moving(ids)]
 
     def observe_masks(

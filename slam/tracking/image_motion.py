@@ -18,7 +18,7 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Bytes, Image, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
-from bmask_slam.tracking.pose_optimisation import (
+from bmask_slam.tracking.pose.pose_optimisation import (
     PoseEstimate,
     PoseOptimisationConfig,
     median,

@@ -7,7 +7,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Arrays
 from bmask_slam.graph.geometry import carried_along, inverse, orthonormalised, se3_exp, se3_log
 from bmask_slam.graph.sensors.odometry import Motion, MotionSensor
-from bmask_slam.tracking.rolling_shutter import PreviousPose
+from bmask_slam.tracking.pose.rolling_shutter import PreviousPose
 
 UNEVEN = 0.25
 """Frames count as evenly spaced if their intervals differ by a smaller share."""
@@ -52,7 +52,7 @@ class MotionModel:
     def previous(self, lost_frames: int) -> PreviousPose | None:
         """The last pose; None where it is too old to give a velocity, or frames were lost since."""
         recent = lost_frames == 0 and 0 < self.ago_s < MAX_AGO_S  # False for NaN
-        return PreviousPose(self.T_world_last, self.ago_s) if recent else None
+        return PreviousPose(self.T_world_last, self.ago_s, self.now_s) if recent else None
 
     def restart(self, T_world_camera: Array) -> None:
         """Begin at a pose (4, 4), without speed."""

@@ -44,6 +44,7 @@ class Tracked:
         visible_ids: landmarks of the local map that project into the frame.
         information: (6, 6) of the pose.
         flow_only: those of the landmarks that rest on the flow of the image alone.
+        moving_ids: new landmarks that have moved against older ones, see `tracking.pose.newcomers`.
         new_ids: (N,) the landmark that tracking has made of each keypoint ahead of the map, -1 for
             none; of no keypoint if it makes none ahead.
     """
@@ -57,6 +58,7 @@ class Tracked:
     visible_ids: Ints
     information: Array
     flow_only: Ints = field(default_factory=no_ids)
+    moving_ids: Ints = field(default_factory=no_ids)
     new_ids: Ints = field(default_factory=no_ids)
 
     @property

@@ -2,65 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from bmask_slam.features.brisk import Features, joined, select
-from bmask_slam.features.matching import (
-    MatchConfig,
-    Matches,
-    WindowIndex,
-    consistent_rotation,
-    match_pairs,
-)
-from bmask_slam.features.patch_alignment import SubpixelConfig, register_patches
+from bmask_slam.features.matching import Matches, WindowIndex, consistent_rotation, match_pairs
+from bmask_slam.features.patch_alignment import register_patches
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
+from bmask_slam.tracking.config import TrackingConfig
 from bmask_slam.tracking.guided_landmarks import Guided, weighted, with_guided, without_unused
-from bmask_slam.tracking.image_motion import ImageMotionConfig
-from bmask_slam.tracking.pose_optimisation import (
+from bmask_slam.tracking.pose.newcomers import Matched, moving_newcomers
+from bmask_slam.tracking.pose.pose_optimisation import (
     PoseEstimate,
     PoseOptimisationConfig,
     optimise_pose,
 )
-from bmask_slam.tracking.results import Tracked, TrackingStatus, lost
-from bmask_slam.tracking.rolling_shutter import (
+from bmask_slam.tracking.pose.rolling_shutter import (
     CameraVelocity,
     PreviousPose,
     at_one_moment,
     corrected,
     motion_since,
 )
+from bmask_slam.tracking.results import Tracked, TrackingStatus, lost
 from bmask_slam.world.landmark_table import LandmarkTable
 from bmask_slam.world.world_map import WorldMap
 
 COARSE_STEP = 1e-3
 """Tolerance of the first estimate in radians and metres: less than a pixel."""
-
-
-@dataclass(frozen=True)
-class TrackingConfig:
-    """Search windows in pixels, and what a frame needs for the status OK and WEAK.
-
-    A frame is WEAK with ``weak_inliers``; it is OK with ``min_inliers`` that are at least half of
-    its matches, and a position with a standard deviation of at most ``max_sigma_m``. The first
-    search is for the last frame's landmarks around their predicted places; if it fails, for the
-    whole local map, then with ``wide_radius_px``; the second, with ``local_radius_px``, for all.
-    """
-
-    search_radius_px: float = 20.0
-    wide_radius_px: float = 60.0
-    local_radius_px: float = 6.0
-    min_inliers: int = 30
-    weak_inliers: int = 15
-    max_sigma_m: float = 0.005
-    max_view_angle_deg: float = 60.0
-    match: MatchConfig = field(default_factory=MatchConfig)
-    pose: PoseOptimisationConfig = field(default_factory=PoseOptimisationConfig)
-    subpixel: SubpixelConfig = field(default_factory=SubpixelConfig)
-    image_motion: ImageMotionConfig = field(default_factory=ImageMotionConfig)
 
 
 class Tracker:
@@ -71,6 +43,7 @@ class Tracker:
         self.config = config
         self._narrow = replace(config.pose, kernel_widths=config.pose.kernel_widths[-2:])
         self._coarse = replace(config.pose, final_rounds=1, step_tolerance=COARSE_STEP)
+        self._second = replace(self._narrow, final_rounds=1, step_tolerance=COARSE_STEP)
 
     def track(
         self,
@@ -126,12 +99,13 @@ class Tracker:
                 features, matches.train, visible[matches.query], T_world_camera[:3, 3], world
             )
         features, loose = weighted(features, matches, guided, self.config.image_motion)
-        features, estimate = self._refined(
-            features, matches, visible, T_world_camera, landmarks, motion
+        features, estimate, moving = self._without_moving(
+            features, matches, visible, T_world_camera, world, previous
         )
         if not estimate.ok or estimate.inliers.sum() < self.config.weak_inliers:
             return lost(T_world_camera, detected, len(matches))
-        found = self._result(features, matches, visible, estimate, loose)
+        found = self._result(features, matches[~moving], visible, estimate, loose[~moving])
+        found = replace(found, moving_ids=visible[matches.query[moving]])
         return without_unused(found, guided) if guided else found
 
     def _result(
@@ -159,6 +133,29 @@ class Tracker:
             information=estimate.information,
             flow_only=visible[kept.query[loose]],
         )
+
+    def _without_moving(
+        self,
+        features: Features,
+        matches: Matches,
+        ids: Ints,
+        T_world_camera: Array,
+        world: WorldMap,
+        previous: PreviousPose | None,
+    ) -> tuple[Features, PoseEstimate, Mask]:
+        """As of `_refined`, but for new landmarks that move, and which matches (N,) these are."""
+        landmarks, motion = world.landmarks, motion_since(previous, T_world_camera, self.camera)
+        found, estimate = self._refined(features, matches, ids, T_world_camera, landmarks, motion)
+        moving = np.zeros(len(matches), bool)
+        if previous is None or not estimate.ok:
+            return found, estimate, moving
+        matched = Matched.of(found, matches.train, ids[matches.query], previous.now_s, world)
+        rules = self.config.newcomers, self._second
+        moving = moving_newcomers(matched, estimate.T_world_camera, self.camera, *rules)
+        if not moving.any():
+            return found, estimate, moving
+        left = matches[~moving]
+        return *self._refined(features, left, ids, T_world_camera, landmarks, motion), moving
 
     def _refined(
         self,

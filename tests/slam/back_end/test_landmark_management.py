@@ -24,7 +24,8 @@ from bmask_slam.back_end.landmark_management import (
 from bmask_slam.features.brisk import select
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import se3_exp
-from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.tracking.config import TrackingConfig
+from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
 from bmask_slam.world.world_map import WorldMap

@@ -12,7 +12,8 @@ from bmask_slam.back_end.landmark_management import MappingConfig
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.loops.closing import LoopClosingConfig
-from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.tracking.config import TrackingConfig
+from bmask_slam.tracking.tracker import Tracker
 
 ALONE = 3
 """Points that each keyframe sees alone."""

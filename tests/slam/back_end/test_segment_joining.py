@@ -33,9 +33,10 @@ from bmask_slam.graph.factors.graph_update import (
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.inertial.tables import ImuModel, InertialFactor, InertialUpdate
 from bmask_slam.sensing.reference_frame import RETIRED_FRAME
+from bmask_slam.tracking.config import TrackingConfig
 from bmask_slam.tracking.relocalisation import RelocalisationConfig
 from bmask_slam.tracking.results import Tracked, TrackingStatus
-from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.world_map import WorldMap
 

@@ -18,8 +18,9 @@ from bmask_slam.graph.factors.graph_estimate import RelativePoseErrors
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, se3_log, so3_exp, transform
 from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
 from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.tracking.config import TrackingConfig
 from bmask_slam.tracking.results import starting
-from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 

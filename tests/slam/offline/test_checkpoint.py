@@ -24,7 +24,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.offline.runner import RunOptions, resume, run
 from bmask_slam.run_folder.folder import CHECKPOINT, FILES, GROWING, RunFolder
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.tracking.tracker import TrackingConfig
+from bmask_slam.tracking.config import TrackingConfig
 
 EVERY = 6
 

@@ -31,7 +31,7 @@ from bmask_slam.offline.runner import RunOptions, RunSummary, run
 from bmask_slam.run_folder.folder import FILES
 from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.tracking.tracker import TrackingConfig
+from bmask_slam.tracking.config import TrackingConfig
 
 METRICS = [
     "tracked_share",

@@ -29,7 +29,8 @@ from bmask_slam.graph.sensors.markers import CORNERS, MarkerPose, MarkersConfig,
 from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.sensing import marker_fusion
 from bmask_slam.sensing.marker_sightings import WORDS, MarkerSight, Verdict, drift_path
-from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.tracking.config import TrackingConfig
+from bmask_slam.tracking.tracker import Tracker
 
 SIGMA = 0.15 / 525
 SIZE_M, STEP_S = 0.2, 0.25

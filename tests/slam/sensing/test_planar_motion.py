@@ -13,7 +13,8 @@ from bmask_slam.graph.geometry import inverse, se3_exp
 from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.graph.sensors.mounting import T_of
 from bmask_slam.graph.sensors.planar import PlanarConfig
-from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.tracking.config import TrackingConfig
+from bmask_slam.tracking.tracker import Tracker
 
 MOUNTING = (0.2, 0.1, 0.6, 0.5, -0.5, 0.5, -0.5)
 

@@ -25,10 +25,11 @@ from bmask_slam.graph.geometry import se3_exp, se3_log
 from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.sensing.sensor_fusion import SensorFusion
 from bmask_slam.tracking.camera_tracker import CameraTracker
+from bmask_slam.tracking.config import TrackingConfig
+from bmask_slam.tracking.pose.rolling_shutter import PreviousPose
 from bmask_slam.tracking.relocalisation import RelocalisationConfig
 from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, starting
-from bmask_slam.tracking.rolling_shutter import PreviousPose
-from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.local_map import LocalMapConfig
 from bmask_slam.world.world_map import WorldMap

@@ -16,10 +16,11 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.tracking.config import TrackingConfig
 from bmask_slam.tracking.guided_landmarks import Guided, GuidedLandmarks, weighted, with_guided
 from bmask_slam.tracking.image_motion import ImageMotion, ImageMotionConfig, LastView
 from bmask_slam.tracking.results import TrackingStatus
-from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.landmark_table import LandmarkTable
 from bmask_slam.world.world_map import WorldMap
 

@@ -14,6 +14,7 @@ from bmask_slam.features.brisk import BriskExtractor, FeatureConfig
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
+from bmask_slam.tracking.config import TrackingConfig
 from bmask_slam.tracking.motion_model import MotionModel
 from bmask_slam.tracking.relocalisation import (
     RelocalisationConfig,
@@ -22,7 +23,7 @@ from bmask_slam.tracking.relocalisation import (
     similar_keyframes,
 )
 from bmask_slam.tracking.results import Tracked
-from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.local_map import LocalMapConfig
 from bmask_slam.world.world_map import WorldMap

@@ -19,8 +19,9 @@ from bmask_slam.features.matching import WindowIndex, hamming
 from bmask_slam.features.patch_alignment import SubpixelConfig
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
+from bmask_slam.tracking.config import TrackingConfig
 from bmask_slam.tracking.results import Tracked, TrackingStatus, best, lost, starting
-from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.world_map import WorldMap
 
 PLAIN = TrackingConfig(subpixel=SubpixelConfig(enabled=False))

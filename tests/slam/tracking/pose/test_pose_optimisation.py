@@ -7,14 +7,14 @@ from synthetic_view import CAMERA, T_NEW_OLD, points_before
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
-from bmask_slam.tracking.pose_optimisation import (
+from bmask_slam.tracking.pose.pose_optimisation import (
     PoseOptimisationConfig,
     jacobian,
     median,
     optimise_pose,
     residuals,
 )
-from bmask_slam.tracking.reprojection import Reprojection, moved
+from bmask_slam.tracking.pose.reprojection import Reprojection, moved
 
 T_WORLD_CAMERA = se3_exp(np.array([0.2, -0.5, 0.1, 1.0, -2.0, 0.5]))
 SIGMAS_PX = np.array([0.7, 0.7, 0.12])

@@ -16,7 +16,7 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, se3_log
-from bmask_slam.tracking.pose_optimisation import PoseEstimate, jacobian, median, residuals
+from bmask_slam.tracking.pose.pose_optimisation import PoseEstimate, jacobian, median, residuals
 
 ACCELERATION = 2.0
 """Standard deviation of the acceleration of a hand-held camera, in rad/s^2 and m/s^2."""
@@ -25,10 +25,15 @@ FAR_M = 1e6
 
 @dataclass(frozen=True)
 class PreviousPose:
-    """An earlier pose: T_world_camera (4, 4), and how many seconds before the image it was."""
+    """An earlier pose: T_world_camera (4, 4), and how many seconds before the image it was.
+
+    Attributes:
+        now_s: the image's stamp.
+    """
 
     T_world_camera: Array
     ago_s: float
+    now_s: float
 
     def twist_to(self, T_world_camera: Array) -> Array:
         """The mean velocity (6,) from it to the image's pose (4, 4)."""

@@ -13,8 +13,8 @@ from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.metrics import align
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.tracking.pose_optimisation import optimise_pose
-from bmask_slam.tracking.rolling_shutter import (
+from bmask_slam.tracking.pose.pose_optimisation import optimise_pose
+from bmask_slam.tracking.pose.rolling_shutter import (
     CameraVelocity,
     PreviousPose,
     at_one_moment,
@@ -90,7 +90,7 @@ def test_a_keypoint_without_depth_moves_as_at_the_median_depth() -> None:
 
 def test_nothing_moves_where_all_rows_are_exposed_at_once_or_the_motion_is_unknown() -> None:
     features, _ = exposed(scene(), 0.025)
-    previous = PreviousPose(np.eye(4), 0.03)
+    previous = PreviousPose(np.eye(4), 0.03, 0.03)
     assert motion_since(previous, T_WORLD_CAMERA, CAMERA) is None
     assert motion_since(None, T_WORLD_CAMERA, ROLLING) is None
     assert at_one_moment(features, ROLLING, None) is features
@@ -98,7 +98,7 @@ def test_nothing_moves_where_all_rows_are_exposed_at_once_or_the_motion_is_unkno
 
 def test_the_motion_is_that_since_the_previous_pose() -> None:
     before = T_WORLD_CAMERA @ se3_exp(-0.04 * TWIST)
-    motion = motion_since(PreviousPose(before, 0.04), T_WORLD_CAMERA, ROLLING)
+    motion = motion_since(PreviousPose(before, 0.04, 0.04), T_WORLD_CAMERA, ROLLING)
     assert motion is not None
     np.testing.assert_allclose(motion.twist, TWIST, atol=1e-9)
 

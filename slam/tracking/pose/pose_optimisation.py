@@ -11,7 +11,7 @@ from scipy.linalg.lapack import dposv
 from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, orthonormalised, transform
-from bmask_slam.tracking.reprojection import Reprojection, moved
+from bmask_slam.tracking.pose.reprojection import Reprojection, moved
 
 CHI2_3DOF = 7.815  # 95 %
 CHI2_2DOF = 5.991

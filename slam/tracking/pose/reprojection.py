@@ -1,8 +1,8 @@
 """Reprojection errors of one camera's matches, and their normal equations, made for speed.
 
 Tracking evaluates them a dozen times a frame. The formulas are those of `residuals` and `jacobian`
-in `tracking.pose_optimisation`, with which the tests compare them. Here points are columns, so that
-operations run along contiguous memory; residual and Jacobian share intermediate results.
+in `tracking.pose.pose_optimisation`, with which the tests compare them. Here points are columns, so
+that operations run along contiguous memory; residual and Jacobian share intermediate results.
 """
 
 from __future__ import annotations

@@ -1,0 +1,1 @@
+"""One frame's pose from its matches: optimisation, rolling shutter, new landmarks that move."""
