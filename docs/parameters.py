@@ -120,6 +120,8 @@ def unit(name: str, hint: Any) -> str:
     """The unit of a parameter, by its name and type."""
     if hint is bool:
         return "true, false"
+    if name.endswith("_m_s"):
+        return "m/s"
     per = re.search(r"_(\w+)_per_(\w+)$", name)
     if per and {per[1].rpartition("_")[2], per[2]} <= {*UNITS, "sqrt"}:
         return f"{UNITS[per[1].rpartition('_')[2]]} per {per[2]}"

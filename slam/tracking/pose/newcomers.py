@@ -29,11 +29,15 @@ from bmask_slam.world.world_map import WorldMap
 class NewcomerConfig:
     """When new landmarks move against older ones.
 
-    A landmark is new for ``new_s`` after the keyframe that made it. The older ones must give a pose
-    by themselves: ``min_older`` inliers, and a standard deviation of the position of at most
-    ``max_sigma_m``. A new one has left its place if it is off in the image by more than ``gate``
-    variances a degree of freedom, and by more than ``min_speed_m_s`` times its age. New landmarks
-    move if ``min_moving`` of them have left their places, which are ``min_share`` of the new ones.
+    Attributes:
+        new_s: a landmark is new for so long after the keyframe that made it.
+        min_older: so many inliers among the older ones, half of their matches, give a pose.
+        max_sigma_m: largest standard deviation of the position by them.
+        gate: a new one has left its place if it is farther off in the image, in variances a degree
+            of freedom, ...
+        min_speed_m_s: ... and farther than at this speed since its keyframe.
+        min_moving: new landmarks move if so many of them have left their places ...
+        min_share: ... and this share of the new ones.
     """
 
     new_s: float = 0.3

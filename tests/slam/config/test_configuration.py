@@ -242,6 +242,7 @@ def test_a_count_below_zero_is_refused() -> None:
         ("features.bucket_px=0", "bucket_px at least 1"),
         ("tracking.pose.kernel_iterations=0", "kernel_iterations and final_iterations must be"),
         ("tracking.image_motion.window_px=2", "window_px must be at least 3"),
+        ("tracking.newcomers.gate=0", "gate, min_speed_m_s and max_sigma_m positive"),
         ("tracking.pose.max_noise_scale=0", "max_noise_scale must be at least 1"),
         ("tracking.match.max_scale_ratio=0", "max_scale_ratio must be more than 1"),
         ("features.pixel_sigma=0", "pixel_sigma and disparity_sigma_px must be more than 0"),
