@@ -8,7 +8,7 @@ from synthetic_view import CAMERA, add_keyframe, make_features, random_descripto
 
 from bmask_slam.features.patch_alignment import SubpixelConfig
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.tracking.config import TrackingConfig
 from bmask_slam.tracking.pose.newcomers import NewcomerConfig
 from bmask_slam.tracking.pose.rolling_shutter import PreviousPose
