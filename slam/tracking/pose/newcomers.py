@@ -79,11 +79,13 @@ class Matched:
     ) -> Matched:
         """Landmarks (N,) that are observed by keypoints (N,) of a frame.
 
-        A landmark whose first keyframe was culled has been known for ever.
+        Landmarks have been known for ever whose first keyframe was culled, or is of an earlier
+        recording with later stamps.
         """
         hosts, place = np.unique(world.landmarks.host[ids], return_inverse=True)
         keyframes = [world.keyframes.get(int(host)) for host in hosts]
         known_s = np.array([np.inf if k is None else now_s - k.timestamp_s for k in keyframes])
+        known_s[known_s < 0] = np.inf
         measured = features.measurements[keypoints], features.sigmas_px[keypoints]
         return cls(world.landmarks.points_world[ids], *measured, known_s[place])
 

@@ -10,7 +10,7 @@ from bmask_slam.features.patch_alignment import SubpixelConfig
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.tracking.config import TrackingConfig
-from bmask_slam.tracking.pose.newcomers import NewcomerConfig
+from bmask_slam.tracking.pose.newcomers import Matched, NewcomerConfig
 from bmask_slam.tracking.pose.rolling_shutter import PreviousPose
 from bmask_slam.tracking.results import Tracked, TrackingStatus
 from bmask_slam.tracking.tracker import Tracker
@@ -103,6 +103,21 @@ def test_what_a_frame_did_not_see_before_is_new_for_a_while_alone() -> None:
     """Half a second after a keyframe its landmarks are as good as others."""
     tracked, _ = tracked_among(0.8, new_s=0.05)
     assert len(tracked.moving_ids) == 0
+
+
+def test_landmarks_of_another_recording_or_a_culled_keyframe_are_old() -> None:
+    """A map that a later recording goes on with may have later stamps."""
+    world, looks = WorldMap(), random_descriptors(30, np.random.default_rng(1))
+    points = part_of_image(40, 300, (2.4, 3.4), 30)
+    features = make_features(np.eye(4), points, looks)
+    for rows in (np.arange(10), np.arange(10, 20), np.arange(20, 30)):
+        world.make_landmarks(add_keyframe(world, np.eye(4), features), rows, points[rows])
+    world.landmarks.host[:10] = 17  # not there
+    ids = np.arange(30)
+    matched = Matched.of(features, ids, ids, NOW_S, world)
+    assert np.isinf(matched.ages_s[:10]).all()
+    assert np.allclose(matched.ages_s[10:20], 2 * FRAME_S)
+    assert np.isinf(matched.ages_s[20:]).all()  # of a keyframe at 0.67 s
 
 
 @pytest.mark.parametrize(
