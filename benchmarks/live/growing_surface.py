@@ -69,7 +69,7 @@ def live(
     row = {"frames": health.frames, "cpu ms a frame": 1e3 * used_s / health.frames}
     row |= {"latency ms": health.latency_ms_median, "95 %": health.latency_ms_p95}
     row |= {"played s": played_s, "dense cpu s": dense_s}
-    row |= {"by then": health.surface_frames}
+    row |= {"keyframes by then": health.submaps, "frames by then": health.surface_frames}
     row |= {"in the end": 0 if slam.dense is None else slam.dense.frames}
     return row | {"dropped": health.surface_frames_dropped, "finish s": ended_s}
 
