@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -99,12 +100,14 @@ class Tracker:
                 features, matches.train, visible[matches.query], T_world_camera[:3, 3], world
             )
         features, loose = weighted(features, matches, guided, self.config.image_motion)
-        features, estimate, moving = self._without_moving(
-            features, matches, visible, T_world_camera, world, previous
-        )
+
+        def pose_by(some: Matches) -> tuple[Features, PoseEstimate]:
+            return self._refined(features, some, visible, T_world_camera, landmarks, motion)
+
+        seen, estimate, moving = self._without_moving(pose_by, matches, visible, world, previous)
         if not estimate.ok or estimate.inliers.sum() < self.config.weak_inliers:
             return lost(T_world_camera, detected, len(matches))
-        found = self._result(features, matches[~moving], visible, estimate, loose[~moving])
+        found = self._result(seen, matches[~moving], visible, estimate, loose[~moving])
         found = replace(found, moving_ids=visible[matches.query[moving]])
         return without_unused(found, guided) if guided else found
 
@@ -136,26 +139,26 @@ class Tracker:
 
     def _without_moving(
         self,
-        features: Features,
+        pose_by: Callable[[Matches], tuple[Features, PoseEstimate]],
         matches: Matches,
         ids: Ints,
-        T_world_camera: Array,
         world: WorldMap,
         previous: PreviousPose | None,
     ) -> tuple[Features, PoseEstimate, Mask]:
-        """As of `_refined`, but for new landmarks that move, and which matches (N,) these are."""
-        landmarks, motion = world.landmarks, motion_since(previous, T_world_camera, self.camera)
-        found, estimate = self._refined(features, matches, ids, T_world_camera, landmarks, motion)
+        """What ``pose_by`` gives without new landmarks that move, and which matches (N,) these are.
+
+        Query numbers of the matches are positions in ``ids``.
+        """
+        found, estimate = pose_by(matches)
         moving = np.zeros(len(matches), bool)
         if previous is None or not estimate.ok:
             return found, estimate, moving
         matched = Matched.of(found, matches.train, ids[matches.query], previous.now_s, world)
         rules = self.config.newcomers, self._second
         moving = moving_newcomers(matched, estimate.T_world_camera, self.camera, *rules)
-        if not moving.any():
-            return found, estimate, moving
-        left = matches[~moving]
-        return *self._refined(features, left, ids, T_world_camera, landmarks, motion), moving
+        if moving.any():
+            found, estimate = pose_by(matches[~moving])
+        return found, estimate, moving
 
     def _refined(
         self,

@@ -79,8 +79,8 @@ class Matched:
     ) -> Matched:
         """Landmarks (N,) that are observed by keypoints (N,) of a frame.
 
-        Landmarks have been known for ever whose first keyframe was culled, or is of an earlier
-        recording with later stamps.
+        A landmark is as old as its host: the keyframe that made it, or that one's parent once it
+        was culled. One whose host is of an earlier recording with later stamps was always known.
         """
         hosts, place = np.unique(world.landmarks.host[ids], return_inverse=True)
         keyframes = [world.keyframes.get(int(host)) for host in hosts]
@@ -110,20 +110,15 @@ def moving_newcomers(
     new = matched.ages_s <= config.new_s
     if new.sum() < config.min_moving or (~new).sum() < config.min_older:
         return moving
-    older = _pose(matched[~new], T_world_camera, camera, pose)
+    known = matched[~new]
+    seen = known.points_world, known.measurements, known.sigmas_px
+    older = optimise_pose(T_world_camera, *seen, camera, pose)
     count = older.inliers.sum()
-    known = older.ok and count >= config.min_older and 2 * count >= len(older.inliers)
-    if known and older.position_sigma_m <= config.max_sigma_m:
+    agree = older.ok and count >= config.min_older and 2 * count >= len(older.inliers)
+    if agree and older.position_sigma_m <= config.max_sigma_m:
         moving[new] = _have_left(matched[new], older, camera, config)
     is_many = moving.sum() >= max(config.min_moving, config.min_share * new.sum())
     return moving & is_many
-
-
-def _pose(
-    matched: Matched, T_world_camera: Array, camera: Camera, pose: PoseOptimisationConfig
-) -> PoseEstimate:
-    seen = matched.points_world, matched.measurements, matched.sigmas_px
-    return optimise_pose(T_world_camera, *seen, camera, pose)
 
 
 def _have_left(

@@ -105,7 +105,7 @@ def test_what_a_frame_did_not_see_before_is_new_for_a_while_alone() -> None:
     assert len(tracked.moving_ids) == 0
 
 
-def test_landmarks_of_another_recording_or_a_culled_keyframe_are_old() -> None:
+def test_landmarks_of_another_recording_or_without_a_keyframe_are_old() -> None:
     """A map that a later recording goes on with may have later stamps."""
     world, looks = WorldMap(), random_descriptors(30, np.random.default_rng(1))
     points = part_of_image(40, 300, (2.4, 3.4), 30)
