@@ -27,6 +27,8 @@ from bmask_slam.graph.smoother.anchoring import (
 
 HOPS = 3
 """Relative poses from keyframes that lose something to those through which they may be linked."""
+STILL = 0.25
+"""A landmark stays while its rays' parallax is this share of what a new one must have."""
 
 
 @dataclass(frozen=True)
@@ -65,31 +67,23 @@ class _Plan:
     loose: Ints
 
 
-def with_behind_removed(
-    update: GraphUpdate, tables: FactorTables, config: SmootherConfig
+def with_lost_removed(
+    update: GraphUpdate, tables: FactorTables, config: SmootherConfig, share: float = STILL
 ) -> GraphUpdate:
-    """The update, which removes observations whose landmark is behind the camera as well.
+    """The update, which removes observations that hold nothing any more as well.
 
     A step of the optimisation may carry a landmark of no depth and little parallax past infinity or
-    through its cameras. Its factors then hold nothing (their Jacobian is zero), and GTSAM fails
-    when it next linearises them.
-    """
-    observations = tables.observations.select(tables.observations.used_rows())
-    depth_m = depths_m(*tables.values_of(observations))
-    return _without(update, observations.pairs[depth_m < config.min_depth_m])
-
-
-def with_far_removed(
-    update: GraphUpdate, tables: FactorTables, config: SmootherConfig
-) -> GraphUpdate:
-    """The update, which removes landmarks that no view's depth or parallax constrains as well.
-
-    Of no depth, they were carried so far away that GTSAM would fail at their next linearisation.
+    through its cameras, and each further step twice as far away. The Jacobian of its factors is
+    zero then, or nearly so along its ray, and GTSAM fails when it next linearises them. Removed are
+    observations of landmarks behind the camera, and landmarks whose rays' parallax is less than a
+    ``share`` of what a new one must have.
     """
     observations = tables.observations.select(tables.observations.used_rows())
     values = tables.values_of(observations)
-    constrained = constrained_landmarks(observations, *values, config.min_parallax_deg)
-    return _without(update, observations.pairs[~np.isin(observations.landmark_ids, constrained)])
+    lost = depths_m(*values) < config.min_depth_m
+    constrained = constrained_landmarks(observations, *values, share * config.min_parallax_deg)
+    lost |= ~np.isin(observations.landmark_ids, constrained)
+    return _without(update, observations.pairs[lost])
 
 
 def _without(update: GraphUpdate, pairs: Ints) -> GraphUpdate:

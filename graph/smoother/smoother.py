@@ -37,7 +37,7 @@ from bmask_slam.graph.marginals.landmark_marginalisation import (
 from bmask_slam.graph.marginals.summaries import mark_retracted, mark_returned, with_returning
 from bmask_slam.graph.smoother.anchoring import anchor_components, release_anchors, with_first_prior
 from bmask_slam.graph.smoother.isam2 import Change, Solver, SolverError, apply_user_and_inertial
-from bmask_slam.graph.smoother.removal import Removal, remove, with_behind_removed, with_far_removed
+from bmask_slam.graph.smoother.removal import Removal, remove, with_lost_removed
 from bmask_slam.graph.smoother.repair import repair, solve_without_own
 from bmask_slam.graph.smoother.storage import (
     factor_tables_of,
@@ -75,7 +75,7 @@ class Smoother:
         self._solver.elapsed_s = 0.0
         tables, model = self._tables, (self._tables, self._camera, self._config)
         update = with_first_prior(update, tables, self._config)
-        update = with_behind_removed(update, tables, self._config)
+        update = with_lost_removed(update, tables, self._config)
         # marginalised observations first: their new relative poses still hold the keyframes
         before = remove_marginalised(update, *model)
         removal = remove(update, tables, self._config)
@@ -122,8 +122,8 @@ class Smoother:
                     logger.error("batch optimisation failed; the values stay as they were")
                     break
             wrong = no_pairs() if last else wrong_observations(self._tables, self._camera)
-            update = with_behind_removed(GraphUpdate(remove_observations=wrong), *model)
-            report.add_removal(remove(with_far_removed(update, *model), *model))
+            update = with_lost_removed(GraphUpdate(remove_observations=wrong), *model, 1.0)
+            report.add_removal(remove(update, *model))
         before, after = costs[-1]
         estimate = report.estimate(self._tables, self._solver.elapsed_s)
         return dataclasses.replace(estimate, cost_before=before, cost_after=after)

@@ -1,8 +1,9 @@
 """The other processes' answers, each used at a frame that does not depend on how fast they are.
 
-What tracking sends with a frame is answered before the frame that is ``LAG`` later, and not used
-earlier, however soon it comes; where masks are urgent, all is answered before the next frame. So
-tracking, map and masks work at the same time, and a run that is repeated gives the same bytes.
+What tracking sends with a frame is answered before the first frame that is LAG_S later by its
+stamp, and not used earlier, however soon it comes; where masks are urgent, all is answered before
+the next frame. So tracking, map and masks work at the same time, and a run that is repeated gives
+the same bytes. The live loop takes about as long; with less, tracking waits for the others.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,14 @@ logger = logging.getLogger(__name__)
 
 WAIT_S = 600.0
 """Longest wait for an answer."""
+LAG_S = 0.25
+MOST_LAG = 15
+"""An answer is used so long after, but ``LAG`` frames at least, and so many at the most."""
+
+
+def is_due(frames: int, seconds: float) -> bool:
+    """Whether what was sent so many frames and seconds ago is used now."""
+    return frames >= LAG and (seconds >= LAG_S or frames >= MOST_LAG)
 
 
 class LockstepMapper(RemoteMapper):
@@ -57,17 +66,18 @@ class LockstepMapper(RemoteMapper):
         """A process begins, to which nothing was sent."""
         self.handled = self._due = 0  # numbers of messages
         self._answers: deque[Any] = deque()
-        self._ends: deque[int] = deque()  # last messages of frames
+        self._ends: deque[tuple[float, int]] = deque()  # stamps and last messages of frames
         self._kept: list[Any] = []
 
-    def begin_frame(self) -> None:
-        """Answers to what was sent until ``LAG`` frames ago are due."""
-        while len(self._ends) >= LAG:
-            self._due = self._ends.popleft()
+    def begin_frame(self, timestamp_s: float) -> None:
+        """A frame begins: answers to what was sent some frames ago are due."""
+        self._stamp_s = timestamp_s
+        while self._ends and is_due(len(self._ends), timestamp_s - self._ends[0][0]):
+            self._due = self._ends.popleft()[1]
 
     def end_frame(self) -> None:
         """What was sent since the last call belongs to this frame."""
-        self._ends.append(self.worker.sent)
+        self._ends.append((self._stamp_s, self.worker.sent))
 
     def all_due(self) -> None:
         """Answers to all that was sent are due."""
@@ -144,6 +154,15 @@ class LockstepMapper(RemoteMapper):
         return super().finish(timeout_s, frames)
 
 
+@dataclass(frozen=True, eq=False)
+class _Requested:
+    """An image whose masks were requested, and with which frame."""
+
+    frame: int
+    timestamp_s: float
+    image: ImageToSegment
+
+
 class LockstepSegmenter(RemoteSegmenter):
     """A remote segmenter whose masks are used at frames that are the same in every run.
 
@@ -158,18 +177,21 @@ class LockstepSegmenter(RemoteSegmenter):
 
     def begin(self) -> None:
         """The run begins, or begins anew."""
-        self._frame = 0
+        self._frame, self._stamp_s = 0, 0.0
         self.urgent = {}
-        self._images: deque[tuple[int, ImageToSegment]] = deque()  # of which masks will be used
+        self._images: deque[_Requested] = deque()  # of which masks will be used
+        self._due = 0  # of these
         self._found: dict[int, Masks] = {}
 
-    def begin_frame(self) -> None:
-        """Masks that were requested ``LAG`` frames ago are due."""
-        self._frame += 1
+    def begin_frame(self, timestamp_s: float) -> None:
+        """A frame begins: masks that were requested some frames ago are due."""
+        self._frame, self._stamp_s = self._frame + 1, timestamp_s
+        ages = ((self._frame - r.frame, timestamp_s - r.timestamp_s) for r in self._images)
+        self._due = sum(is_due(*age) for age in ages)
 
     def use_all(self) -> None:
         """All masks that were requested are due."""
-        self._frame += LAG
+        self._due = len(self._images)
 
     @property
     def waiting(self) -> int:
@@ -178,11 +200,11 @@ class LockstepSegmenter(RemoteSegmenter):
 
     def awaits(self, keyframe_id: int) -> bool:
         """Whether the masks of a keyframe may still be used."""
-        return any(image.keyframe_id == keyframe_id for _, image in self._images)
+        return any(r.image.keyframe_id == keyframe_id for r in self._images)
 
     def request(self, image: ImageToSegment) -> None:
         """Request the masks of a keyframe; returns at once."""
-        self._images.append((self._frame, image))
+        self._images.append(_Requested(self._frame, self._stamp_s, image))
         known = self.memory.recall(image.name)
         if known is None:
             super().request(image)
@@ -192,8 +214,9 @@ class LockstepSegmenter(RemoteSegmenter):
     def receive_masks(self) -> list[Masks]:
         """The masks that are due, once they have come."""
         due = []
-        while self._images and self._images[0][0] <= self._frame - LAG:
-            _, image = self._images.popleft()
+        while self._due:
+            self._due -= 1
+            image = self._images.popleft().image
             number = image.keyframe_id
             while number not in self._found and super().awaits(number):
                 self._found |= {masks.keyframe_id: masks for masks in super().receive_masks()}

@@ -49,9 +49,9 @@ class ParallelSystem(LiveSystem):
 
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
         """Use what is due of the other processes, then do the same step as one process does."""
-        self.remote.begin_frame()
+        self.remote.begin_frame(frame.timestamp_s)
         if self.segmenter is not None:
-            self.segmenter.begin_frame()
+            self.segmenter.begin_frame(frame.timestamp_s)
             if self.segmenter.urgent:
                 self._use_all()
         result = super().process(frame, features)

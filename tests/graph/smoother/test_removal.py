@@ -322,3 +322,20 @@ def test_a_landmark_that_is_carried_too_far_away_for_any_parallax_is_dropped() -
     assert not smoother.update(GraphUpdate()).rebuilt
     assert_isam_matches_tables(smoother)
     assert_same_optimum(smoother, ROOM)
+
+
+@pytest.mark.parametrize("far_m", [1e3, 1e6])
+def test_a_landmark_that_updates_carry_ever_farther_is_dropped(far_m: float) -> None:
+    """Each step doubles its distance, until GTSAM fails at the next linearisation."""
+    smoother = filled(ROOM)
+    poses = smoother.estimate().poses_world_camera
+    point, far = (transform(poses[4], np.array([[0.02, 0.02, 1.0]]) * z) for z in (4.0, far_m))
+    seen = [CAMERA.project_stereo(transform(inverse(T), far))[0] for T in poses[3:5]]
+    ids, measured = np.array([900]), np.array(seen) * [1, 1, np.nan]
+    views = Observations(np.array([3, 4]), np.repeat(ids, 2), measured, np.ones((2, 3)))
+    new = GraphUpdate(landmark_ids=ids, points_world=point, observations=views)
+    estimates = [smoother.update(new), *(smoother.update(GraphUpdate()) for _ in range(14))]
+    assert not any(e.rebuilt for e in estimates)
+    assert np.concatenate([e.dropped_landmarks for e in estimates]).tolist() == [900]
+    assert_isam_matches_tables(smoother)
+    assert_same_optimum(smoother, ROOM)

@@ -18,10 +18,11 @@ from faults import children, wait_until
 from bmask_slam.config.configuration import from_tree
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.labelling.awaited_masks import LAG
 from bmask_slam.live.messages import ImageToSegment, Masks, Ready
 from bmask_slam.live.processes import segmentation
 from bmask_slam.offline.runner import RunOptions, resume, run
-from bmask_slam.parallel.lockstep import LAG, LockstepSegmenter
+from bmask_slam.parallel.lockstep import MOST_LAG, LockstepSegmenter
 from bmask_slam.parallel.system import ParallelSystem
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.semantics.segmenters.upright import Upright
@@ -167,8 +168,11 @@ class SlowWorker(SimpleNamespace):
         return False
 
 
+@pytest.mark.parametrize(
+    ("hz", "lag"), [(30.0, 8), (60.0, 15), (12.0, 3), (1.0, LAG), (1e6, MOST_LAG)]
+)
 def test_masks_are_used_some_frames_later_and_made_once_an_image(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, hz: float, lag: int
 ) -> None:
     monkeypatch.setattr(segmentation, "SupervisedWorker", SlowWorker)
     segmenter = LockstepSegmenter(SegmenterOptions("light"), Path(), Upright())
@@ -176,12 +180,12 @@ def test_masks_are_used_some_frames_later_and_made_once_an_image(
     for _ in range(2):  # the run begins anew
         segmenter.begin()
         used = []
-        for frame in range(8):
-            segmenter.begin_frame()
+        for frame in range(lag + 5):
+            segmenter.begin_frame(1e9 + frame / hz)
             used += [(frame, masks.keyframe_id) for masks in segmenter.receive_masks()]
             if frame in (0, 1, 4):
                 segmenter.request(ImageToSegment(frame, image, f"{frame}.png"))
-        assert used == [(LAG, 0), (LAG + 1, 1), (LAG + 4, 4)]
+        assert used == [(lag, 0), (lag + 1, 1), (lag + 4, 4)]
         assert segmenter.waiting == 0
     assert segmenter.worker.seen == ["0.png", "1.png", "4.png"]
     segmenter.request(ImageToSegment(9, image, "9.png"))
