@@ -27,19 +27,30 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or any(text in str(error) for text in NO_MEMORY)
 
 
+_noted_mb = [0.0]
+"""Largest peak that was noted."""
+
+
 def peak_rss_mb() -> float:
     """Largest resident memory so far in MB (1e6 bytes), with that of the processes it has.
 
     Linux's VmHWM, each process at its own peak; of one with children, such as the server that
-    workers are forked from, these have its memory too. Elsewhere getrusage, which on Linux would
-    count the parent's memory too, of this process alone.
+    workers are forked from, these have its memory too. Those that have ended count if their peak
+    was noted. Elsewhere getrusage, which on Linux would count the parent's memory too, of this
+    process alone.
     """
     if own := _linux_peak_mb(os.getpid()):
-        return own + sum(_peak_of_leaves_mb(child) for child in _children(os.getpid()))
+        leaves_mb = sum(_peak_of_leaves_mb(child) for child in _children(os.getpid()))
+        return max(_noted_mb[0], own + leaves_mb)
     import resource  # noqa: PLC0415 - Unix only
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak * (1 if sys.platform == "darwin" else 1024) / 1e6
+
+
+def note_peak() -> None:
+    """Note the peak so far: to be called before a process ends, whose own is gone then."""
+    _noted_mb[0] = peak_rss_mb()
 
 
 def _linux_peak_mb(pid: int) -> float:

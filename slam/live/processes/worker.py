@@ -32,6 +32,7 @@ from bmask_slam.live.shared_memory import SIZE, Ring, anonymous_file
 from bmask_slam.runtime import fork_server
 from bmask_slam.runtime.fork_server import Start
 from bmask_slam.runtime.forked_process import ForkedProcess
+from bmask_slam.runtime.memory import note_peak
 from bmask_slam.runtime.stop_request import SIGNALS
 
 logger = logging.getLogger(__name__)
@@ -174,6 +175,7 @@ class Worker:
 
     def stop(self, timeout_s: float = 5.0) -> None:
         """Let it handle what was sent, receive its answers, then end it; kill it if it is slow."""
+        note_peak()
         self._channel.finish(timeout_s)
         try:
             self._process.wait(timeout_s)
@@ -185,6 +187,7 @@ class Worker:
 
     def kill(self) -> None:
         """Kill it. The messages that it sent before can still be received."""
+        note_peak()
         if not self._channel.open:  # it is ending by itself
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(ENDING_S)

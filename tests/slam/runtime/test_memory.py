@@ -8,10 +8,39 @@ import sys
 
 import pytest
 
-from bmask_slam.runtime.memory import peak_rss_mb
+from bmask_slam.live.channel import Channel
+from bmask_slam.live.processes.worker import Worker
+from bmask_slam.runtime import memory
+from bmask_slam.runtime.memory import note_peak, peak_rss_mb
 
 HOLDS = "import sys; held = bytearray(b'1') * {size}; print('ready', flush=True); sys.stdin.read()"
 SIZE = 120_000_000
+
+
+@pytest.fixture(autouse=True)
+def _nothing_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "_noted_mb", [0.0])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere this process's own is told alone")
+def test_a_worker_that_has_ended_counts() -> None:
+    """Such as the map's process of ``run --parallel``, which has ended when the run is measured."""
+    before = peak_rss_mb()
+    worker = Worker("holder", "test_memory:hold_until_the_end")
+    while not worker.receive(1.0):
+        assert worker.is_running
+    worker.stop()
+    assert before + 0.9e-6 * SIZE < peak_rss_mb()
+    note_peak()
+    assert before + 0.9e-6 * SIZE < peak_rss_mb() < before + 3e-6 * SIZE
+
+
+def hold_until_the_end(channel: Channel) -> None:
+    """A worker with much memory."""
+    held = bytearray(b"1") * SIZE
+    channel.send(len(held))
+    while channel.open:
+        channel.receive(1.0)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere this process's own is told alone")
