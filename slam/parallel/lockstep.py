@@ -11,9 +11,10 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Arrays
@@ -41,11 +42,49 @@ WAIT_S = 600.0
 LAG_S = 0.25
 MOST_LAG = 15
 """An answer is used so long after, but ``LAG`` frames at least, and so many at the most."""
+T = TypeVar("T")
 
 
-def is_due(frames: int, seconds: float) -> bool:
-    """Whether what was sent so many frames and seconds ago is used now."""
-    return frames >= LAG and (seconds >= LAG_S or frames >= MOST_LAG)
+class Delayed(Generic[T]):
+    """A queue of what is sent with frames, each item of which is due some frames later."""
+
+    def __init__(self) -> None:
+        self._frame, self._stamp_s, self._due = 0, 0.0, 0
+        self._items: deque[tuple[int, float, T]] = deque()
+
+    def __iter__(self) -> Iterator[T]:
+        return (item for _, _, item in self._items)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def begin_frame(self, timestamp_s: float) -> None:
+        """A frame begins; some may be due with it."""
+        self._frame, self._stamp_s = self._frame + 1, timestamp_s
+        self._due = sum(self._is_due(frame, stamp_s) for frame, stamp_s, _ in self._items)
+
+    def _is_due(self, frame: int, timestamp_s: float) -> bool:
+        frames, seconds = self._frame - frame, self._stamp_s - timestamp_s
+        return frames >= LAG and (seconds >= LAG_S or frames >= MOST_LAG)
+
+    def add(self, item: T) -> None:
+        """Add what is sent with this frame."""
+        self._items.append((self._frame, self._stamp_s, item))
+
+    def all_due(self) -> None:
+        """All of them are due."""
+        self._due = len(self._items)
+
+    def clear(self) -> None:
+        """None of them is needed any more."""
+        self._items.clear()
+        self._due = 0
+
+    def take(self) -> Iterator[T]:
+        """Those that are due, each once."""
+        while self._due:
+            self._due -= 1
+            yield self._items.popleft()[2]
 
 
 class LockstepMapper(RemoteMapper):
@@ -66,18 +105,17 @@ class LockstepMapper(RemoteMapper):
         """A process begins, to which nothing was sent."""
         self.handled = self._due = 0  # numbers of messages
         self._answers: deque[Any] = deque()
-        self._ends: deque[tuple[float, int]] = deque()  # stamps and last messages of frames
+        self._ends = Delayed[int]()  # last messages of frames
         self._kept: list[Any] = []
 
     def begin_frame(self, timestamp_s: float) -> None:
         """A frame begins: answers to what was sent some frames ago are due."""
-        self._stamp_s = timestamp_s
-        while self._ends and is_due(len(self._ends), timestamp_s - self._ends[0][0]):
-            self._due = self._ends.popleft()[1]
+        self._ends.begin_frame(timestamp_s)
+        self._due = max(self._ends.take(), default=self._due)
 
     def end_frame(self) -> None:
         """What was sent since the last call belongs to this frame."""
-        self._ends.append((self._stamp_s, self.worker.sent))
+        self._ends.add(self.worker.sent)
 
     def all_due(self) -> None:
         """Answers to all that was sent are due."""
@@ -154,15 +192,6 @@ class LockstepMapper(RemoteMapper):
         return super().finish(timeout_s, frames)
 
 
-@dataclass(frozen=True, eq=False)
-class _Requested:
-    """An image whose masks were requested, and with which frame."""
-
-    frame: int
-    timestamp_s: float
-    image: ImageToSegment
-
-
 class LockstepSegmenter(RemoteSegmenter):
     """A remote segmenter whose masks are used at frames that are the same in every run.
 
@@ -177,21 +206,17 @@ class LockstepSegmenter(RemoteSegmenter):
 
     def begin(self) -> None:
         """The run begins, or begins anew."""
-        self._frame, self._stamp_s = 0, 0.0
         self.urgent = {}
-        self._images: deque[_Requested] = deque()  # of which masks will be used
-        self._due = 0  # of these
+        self._images = Delayed[ImageToSegment]()  # of which masks will be used
         self._found: dict[int, Masks] = {}
 
     def begin_frame(self, timestamp_s: float) -> None:
         """A frame begins: masks that were requested some frames ago are due."""
-        self._frame, self._stamp_s = self._frame + 1, timestamp_s
-        ages = ((self._frame - r.frame, timestamp_s - r.timestamp_s) for r in self._images)
-        self._due = sum(is_due(*age) for age in ages)
+        self._images.begin_frame(timestamp_s)
 
     def use_all(self) -> None:
         """All masks that were requested are due."""
-        self._due = len(self._images)
+        self._images.all_due()
 
     @property
     def waiting(self) -> int:
@@ -200,11 +225,11 @@ class LockstepSegmenter(RemoteSegmenter):
 
     def awaits(self, keyframe_id: int) -> bool:
         """Whether the masks of a keyframe may still be used."""
-        return any(r.image.keyframe_id == keyframe_id for r in self._images)
+        return any(image.keyframe_id == keyframe_id for image in self._images)
 
     def request(self, image: ImageToSegment) -> None:
         """Request the masks of a keyframe; returns at once."""
-        self._images.append(_Requested(self._frame, self._stamp_s, image))
+        self._images.add(image)
         known = self.memory.recall(image.name)
         if known is None:
             super().request(image)
@@ -214,9 +239,7 @@ class LockstepSegmenter(RemoteSegmenter):
     def receive_masks(self) -> list[Masks]:
         """The masks that are due, once they have come."""
         due = []
-        while self._due:
-            self._due -= 1
-            image = self._images.popleft().image
+        for image in self._images.take():
             number = image.keyframe_id
             while number not in self._found and super().awaits(number):
                 self._found |= {masks.keyframe_id: masks for masks in super().receive_masks()}
