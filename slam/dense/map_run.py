@@ -1,4 +1,4 @@
-"""A dense map of a run in one call, from keyframes to pictures, or keyframe by keyframe."""
+"""A dense map of a run in one call, from keyframes to pictures."""
 
 from __future__ import annotations
 
@@ -24,9 +24,6 @@ from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_lock import lock_file
 from bmask_slam.graph.files.whole_file import remove
-from bmask_slam.labelling.awaited_masks import LAG
-from bmask_slam.labelling.mask_memory import MaskMemory, RememberingSegmenter
-from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.labelling.upright_images import upright_of
 from bmask_slam.mapping.inverse_depth.dense_mapper import WINDOW, DenseKeyframe
 from bmask_slam.run_folder.frame_file import FRAMES as FRAME_TABLE
@@ -38,10 +35,7 @@ from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
 from bmask_slam.semantics.segmenters.upright import Upright
 from bmask_slam.semantics.torch_threads import one_thread
 from bmask_slam.sequences.prefetch import prefetched
-from bmask_slam.sequences.sequence import Sequence
-from bmask_slam.tracking.results import FrameResult
 from bmask_slam.world.keyframe import Keyframe
-from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 
@@ -123,14 +117,6 @@ class RunFusion:
         camera, labels = self.run.camera, segmenter.labels
         self._fusion = KeyframeFusion(camera, labels, self.folder, self.options)
 
-    def add(self, keyframe: Keyframe) -> None:
-        """Read a keyframe and fuse it; skip one that cannot be used, with a warning.
-
-        Raises:
-            InputError: the disk is full.
-        """
-        self._fuse(keyframe, self._read(keyframe))
-
     def _read(self, keyframe: Keyframe) -> _Read | InputError:
         """Its images and instances, or why it cannot be used."""
         try:
@@ -190,40 +176,6 @@ def open_fusion(options: MapOptions) -> RunFusion:
     upright = Upright(run.side) if run.side else upright_of(masks, run.sequence)
     segmenter = make_segmenter(masks, run.sequence.folder, find_weights, upright)
     return RunFusion(run, segmenter, replace(options, masks=masks))
-
-
-def dense_follower(
-    world: WorldMap, semantics: SemanticMapper, sequence: Sequence, options: MapOptions
-) -> Callable[[FrameResult], None]:
-    """A function that fuses the keyframes of a run while it goes on, to be called every frame.
-
-    It saves no state of its own: keyframes that a killed run did not fuse, and those that still
-    wait for neighbours at the end, are fused by ``map_run``. So are all others from the moment on
-    when one cannot be written, as on a full disk.
-
-    Raises:
-        InputError: the folder cannot be written, or the options cannot be used.
-    """
-    last = MaskMemory(LAG + 1)
-    segmenter = semantics.segmenter = RememberingSegmenter(semantics.segmenter, last)
-    mapped = MappedRun(options.run, world, [], sequence.camera, sequence=sequence)
-    options = replace(options, masks=semantics.config.segmenter)
-    fusion = RunFusion(mapped, segmenter, options)
-
-    ended = False
-
-    def follow(result: FrameResult) -> None:
-        nonlocal ended
-        keyframe = world.keyframes.get(-1 if result.keyframe_id is None else result.keyframe_id)
-        if keyframe is None or ended:
-            return
-        try:
-            fusion.add(keyframe)
-        except InputError as error:
-            ended = True
-            logger.warning("%s; the rest of the dense map is made at the end", error)
-
-    return follow
 
 
 def write_summary(folder: DenseFolder, summary: MapSummary) -> None:

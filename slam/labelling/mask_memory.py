@@ -20,15 +20,10 @@ _Packed = tuple[list[tuple[Instance, PackedMask]], SurfaceClasses | None, str]
 
 
 class MaskMemory:
-    """What a segmenter found in images, one bit a pixel, by the images' names.
+    """What a segmenter found in images, one bit a pixel, by the images' names."""
 
-    Args:
-        most: of so many images, the last ones; of all if that is None.
-    """
-
-    def __init__(self, most: int | None = None) -> None:
+    def __init__(self) -> None:
         self._found: dict[str, _Packed] | None = {}
-        self._most = most
 
     def recall(self, name: str) -> list[Instance] | None:
         """The instances in an image; None if they are not known."""
@@ -47,8 +42,6 @@ class MaskMemory:
             nothing = np.zeros((0, 0), bool)  # no part of the mask, which would keep all of it
             packed = [(replace(i, mask=nothing), PackedMask.of(i.mask)) for i in instances]
             self._found[name] = packed, surfaces_of(instances), up_of(instances)
-            if self._most is not None and len(self._found) > self._most:
-                del self._found[next(iter(self._found))]
 
     def forget(self) -> None:
         """Keep nothing any more: no frame is tracked again."""

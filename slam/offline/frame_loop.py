@@ -23,9 +23,7 @@ from bmask_slam.sequences.cameras import format_camera
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.sequences.prefetch import FEATURES_AHEAD, prefetched
 from bmask_slam.sequences.sequence import Sequence
-from bmask_slam.system import SlamSystem
 from bmask_slam.system_interface import System
-from bmask_slam.tracking.results import FrameResult
 
 if TYPE_CHECKING:
     from bmask_slam.dense.options import MapOptions
@@ -109,7 +107,6 @@ def process_frames(run: ActiveRun) -> bool:
     checkpoints = Checkpoints(run.folder, run.options, run.sequence, run.calibrator, run.unwritten)
     if not counters.frames:
         _begin(run, checkpoints)
-    fuse = _dense_follower(run) if run.options.dense and not run.options.parallel else None
     start_s, done = time.perf_counter() - counters.wall_s, len(run.indices) - len(remaining)
     with (
         closing(frames),
@@ -120,8 +117,6 @@ def process_frames(run: ActiveRun) -> bool:
             result = system.process(*ready)
             run.folder.write_frame(result)
             counters.count(result)
-            if fuse is not None:
-                fuse(result)
             counters.wall_s = time.perf_counter() - start_s
             bar.update(result.status, counters.keyframes, counters.lost)
             snapshot()
@@ -172,17 +167,6 @@ def _is_to_begin_anew(run: ActiveRun, last: bool) -> bool:
     if anew:
         logger.info("calibration: tracking begins anew with the camera that was found")
     return anew
-
-
-def _dense_follower(run: ActiveRun) -> Callable[[FrameResult], None]:
-    """A function that fuses keyframes into the dense map while the run goes on."""
-    from bmask_slam.dense.map_run import dense_follower  # noqa: PLC0415 - loads torch
-
-    if not isinstance(run.system, SlamSystem):
-        return lambda result: None
-    return dense_follower(
-        run.system.mapper.world, run.system.semantics, run.sequence, map_options(run)
-    )
 
 
 def map_options(run: ActiveRun) -> MapOptions:

@@ -43,7 +43,7 @@ class RunOptions:
             changed.
         calibrate: whether the camera's readout time and delay are found from its motion:
             "auto", and used where that is sure; "report", and only said; "off".
-        dense: also make a dense map, fusing keyframes while the run goes on.
+        dense: also make a dense map, after the last frame.
         mesh_voxel_m: edge of its voxels, for a preview; None: 0.01.
         parallel: tracking, map and masks each have a process, and work at the same time.
         full_size: large images are not reduced, as `open_sequence` does otherwise.

@@ -21,6 +21,7 @@ from bmask_slam.run_folder.map_file import read_map
 from bmask_slam.run_folder.metrics import measure, row, save
 from bmask_slam.run_folder.reader import STOPPED
 from bmask_slam.runtime.memory import give_back_memory
+from bmask_slam.runtime.progress import counting_bar
 from bmask_slam.system import SlamSystem
 
 logger = logging.getLogger(__name__)
@@ -69,7 +70,8 @@ def finish_run(run: ActiveRun) -> RunSummary:
     if options.dense:
         from bmask_slam.dense.map_run import map_run  # noqa: PLC0415 - loads torch
 
-        map_run(map_options(run))
+        with counting_bar(options.quiet) as progress:
+            map_run(map_options(run), progress)
     if stopped_by is None:
         run.folder.complete()
     folder = run.folder.path
@@ -96,7 +98,7 @@ def finish_run(run: ActiveRun) -> RunSummary:
 def _look_back(run: ActiveRun) -> None:
     """Let the calibrator look at the whole run.
 
-    If it finds another camera, a dense map that was made on the way is removed, to be made again.
+    If it finds another camera, a dense map, of a run that was stopped, is removed to be made again.
     """
     source = run.options.map
 

@@ -645,13 +645,6 @@ def test_masks_are_kept_while_the_run_may_begin_anew() -> None:
     assert inner.calls == 2
 
 
-def test_a_memory_of_the_last_images_forgets_the_oldest() -> None:
-    memory = MaskMemory(2)
-    for name in ("a", "b", "c"):
-        memory.keep(name, [])
-    assert [memory.knows(name) for name in ("a", "b", "c")] == [False, True, True]
-
-
 @pytest.mark.parametrize(
     ("name", "parameter"),
     [
