@@ -1,7 +1,9 @@
-"""Type aliases of the numpy arrays that the packages exchange, and empty ones."""
+"""Type aliases of the numpy arrays that the packages exchange, empty ones, digests of rows."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,8 @@ Image = NDArray[np.uint8]  # colour (H, W, 3) or grey (H, W)
 Bytes = NDArray[np.uint8]  # colours of points, image patches, packed bits
 Bits = NDArray[np.uint64]  # binary descriptors, 64 bits a word
 Arrays = dict[str, NDArray[Any]]  # arrays by name, as a file holds them
+
+_ODD, _HALF = np.uint64(0x9E3779B97F4A7C15), np.uint64(32)
 
 
 def no_ids() -> Ints:
@@ -30,3 +34,17 @@ def no_pairs() -> Ints:
 def step_of(whole: int, kept: int) -> int:
     """The step s of ``image[::s]``, which keeps ceil(whole / s) of an image's rows or columns."""
     return -(-whole // max(kept, 1))
+
+
+def digest_rows(columns: Sequence[NDArray]) -> Bits:
+    """A number (N,) for each row of columns (N, ...) of int32 or 8 bytes: equal for equal bytes.
+
+    Two rows that differ have the same number with a probability of 2^-64.
+    """
+    digests = np.zeros(len(columns[0]), np.uint64)
+    for column in (c.astype(np.int64) if c.dtype == np.int32 else c for c in columns):
+        flat = np.ascontiguousarray(column).reshape(len(column), math.prod(column.shape[1:]))
+        for words in flat.view(np.uint64).T:
+            digests = (digests ^ words) * _ODD
+            digests ^= digests >> _HALF
+    return digests

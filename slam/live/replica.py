@@ -7,29 +7,28 @@ patches and observations those that changed.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bmask_slam.back_end.landmark_management import create_landmarks
 from bmask_slam.features.brisk import Features
 from bmask_slam.features.patch_alignment import SubpixelConfig
-from bmask_slam.graph.arrays import Array, Arrays, Bits, Bytes, Ints, Mask
+from bmask_slam.graph.arrays import Array, Arrays, Bits, Bytes, Ints, Mask, digest_rows
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import carried_along, inverse, transform
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.keyframe import Keyframe
+from bmask_slam.world.landmark_table import LandmarkTable
 from bmask_slam.world.world_map import WorldMap
 
 COLUMNS = (
     *("descriptors", "directions", "extent", "angles_rad", "patches", "patch_views"),
     *("colours", "host", "last_keyframe", "observations"),
 )
-"""Columns of the landmark table that are sent; tracking counts ``visible`` and ``found``."""
-_ODD, _HALF = np.uint64(0x9E3779B97F4A7C15), np.uint64(32)
+"""Columns of the landmark table that are sent whenever they change."""
+COUNTED = ("visible", "found")
+"""Columns that are sent with a landmark that is new; then the copy counts them itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +118,7 @@ class DeltaMaker:
             moved=moved,
             points_world=table.points_world[moved],
             ids=ids,
-            columns={name: getattr(table, name)[ids] for name in COLUMNS},
+            columns={name: getattr(table, name)[ids] for name in (*COLUMNS, *COUNTED)},
             replaced_by=replaced_by,
             next_keyframe_id=world.next_keyframe_id,
             label_views=world.label_views,
@@ -164,18 +163,29 @@ class DeltaMaker:
         return fresh
 
 
-def digest_rows(columns: Sequence[NDArray]) -> Bits:
-    """A number (N,) for each row of columns (N, ...) of int32 or 8 bytes: equal for equal bytes.
+class UntoldCounts:
+    """How often frames saw the landmarks of a copy (N,) since the map's owner was told."""
 
-    Two rows that differ have the same number with a probability of 2^-64.
-    """
-    digests = np.zeros(len(columns[0]), np.uint64)
-    for column in (c.astype(np.int64) if c.dtype == np.int32 else c for c in columns):
-        flat = np.ascontiguousarray(column).reshape(len(column), math.prod(column.shape[1:]))
-        for words in flat.view(np.uint64).T:
-            digests = (digests ^ words) * _ODD
-            digests ^= digests >> _HALF
-    return digests
+    def __init__(self) -> None:
+        self._told = np.zeros((2, 0), np.int32)
+
+    def take(self, landmarks: LandmarkTable) -> tuple[Ints, Ints, Ints]:
+        """Ids (V,), frames in whose view they were, and in which they were found; to be told."""
+        told = self._known(landmarks)
+        visible, found = landmarks.visible - told[0], landmarks.found - told[1]
+        ids = np.flatnonzero(visible)
+        self.are_known(ids, landmarks)
+        return ids, visible[ids], found[ids]
+
+    def are_known(self, ids: Ints, landmarks: LandmarkTable) -> None:
+        """The owner knows the counts of landmarks (N,) as they are."""
+        self._known(landmarks)[:, ids] = landmarks.visible[ids], landmarks.found[ids]
+
+    def _known(self, landmarks: LandmarkTable) -> Ints:
+        """The counts (2, N) that the owner knows."""
+        more = max(len(landmarks) - self._told.shape[1], 0)
+        self._told = np.pad(self._told, ((0, 0), (0, more))) if more else self._told
+        return self._told[:, : len(landmarks)]
 
 
 def landmarks_ahead(
@@ -191,7 +201,6 @@ def landmarks_ahead(
     first = len(table)
     reserved = first, first + int(np.count_nonzero(keyframe.free))
     ids = create_landmarks(world, keyframe, camera)
-    table.visible[ids] = table.found[ids] = 0  # the owner counts the keyframe
     table.reserve(*reserved, ids)
     world.renew_patches(keyframe, subpixel)
     new_ids = np.where(keyframe.landmark_ids >= first, keyframe.landmark_ids, -1)
@@ -199,8 +208,8 @@ def landmarks_ahead(
     return new_ids, reserved
 
 
-def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> None:
-    """Make a copy of the map equal to its owner's.
+def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> Ints:
+    """Make a copy of the map equal to its owner's; returns the landmarks that it did not have.
 
     Keyframes that the owner has not received yet stay, with the landmarks that were made of them
     ahead, and keep their pose relative to the newest keyframe that both have. An owner that was
@@ -208,7 +217,7 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
     that it has made itself, which then stay as ones that are not in the map. It may also have
     keyframes that had been culled.
     """
-    ahead = _apply_landmarks(delta, world)
+    ahead, new = _apply_landmarks(delta, world)
     pending = [k for k in world.keyframes.values() if k.id >= delta.next_keyframe_id]
     shared = [i for i in delta.keyframe_ids.tolist() if i in world.keyframes]
     poses = dict(zip(delta.keyframe_ids.tolist(), delta.poses, strict=True))
@@ -230,24 +239,27 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
     history.take_back(kept)
     for keyframe_id, (parent, T_parent_culled) in delta.parents.items():
         history.hand_over(keyframe_id, parent, T_parent_culled)
+    return new
 
 
-def _apply_landmarks(delta: WorldDelta, world: WorldMap) -> Ints:
-    """Returns the landmarks that were made of keyframes that the owner has not received yet."""
+def _apply_landmarks(delta: WorldDelta, world: WorldMap) -> tuple[Ints, Ints]:
+    """Returns the landmarks of keyframes that the owner has not received yet, and its new ones."""
     table = world.landmarks
     table.extend_to(max(delta.size, len(table)))
     in_map = table.in_map & (table.host >= delta.next_keyframe_id)
     in_map[: delta.size] = in_map[table.spare] = False  # spare ids are the owner's
-    ahead = np.flatnonzero(in_map)
+    ahead, had = np.flatnonzero(in_map), table.in_map[delta.ids]
     in_map[: delta.size] = np.unpackbits(delta.in_map, count=delta.size)
     table.set_in_map(in_map)
     table.points_world[delta.moved] = delta.points_world
+    new = np.flatnonzero(~had)
     for name, rows in delta.columns.items():
-        getattr(table, name)[delta.ids] = rows
+        chosen = new if name in COUNTED else slice(None)
+        getattr(table, name)[delta.ids[chosen]] = rows[chosen]
     if delta.replaced_by is not None:
         table.replaced_by[: delta.size] = delta.replaced_by
         table.replaced_by[delta.size :] = -1
-    return ahead
+    return ahead, delta.ids[new]
 
 
 def _keyframe(keyframe_id: int, delta: WorldDelta, world: WorldMap) -> Keyframe:

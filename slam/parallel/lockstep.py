@@ -1,8 +1,9 @@
 """The other processes' answers, each used at a frame that does not depend on how fast they are.
 
 What tracking sends with a frame is answered before the first frame that is LAG_S later by its
-stamp, and not used earlier, however soon it comes; where masks are urgent, all is answered before
-the next frame. So tracking, map and masks work at the same time, and a run that is repeated gives
+stamp, and not used earlier, however soon it comes; a keyframe's landmarks, which the graph has not
+moved yet, come with the frame that is LAG later. Where masks are urgent, all is answered before the
+next frame. So tracking, map and masks work at the same time, and a run that is repeated gives
 the same bytes. The live loop takes about as long; with less, tracking waits for the others.
 """
 
@@ -17,13 +18,13 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from bmask_slam.features.descriptor_index import DescriptorIndex
-from bmask_slam.graph.arrays import Arrays
+from bmask_slam.graph.arrays import Arrays, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import part
 from bmask_slam.labelling.awaited_masks import LAG
 from bmask_slam.labelling.mask_memory import MaskMemory
-from bmask_slam.live.messages import FramesTracked, ImageToSegment, Masks, SaveState
+from bmask_slam.live.messages import FramesTracked, ImageToSegment, MapChanged, Masks, SaveState
 from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.processes.map_worker import MapWorker
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
@@ -31,8 +32,11 @@ from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.semantics.segmenters.upright import Upright
+from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import Tracked
 from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.keyframe import Keyframe
 from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
@@ -48,7 +52,9 @@ T = TypeVar("T")
 class Delayed(Generic[T]):
     """A queue of what is sent with frames, each item of which is due some frames later."""
 
-    def __init__(self) -> None:
+    def __init__(self, lag_s: float) -> None:
+        """``LAG`` frames later, or more until ``lag_s`` have passed."""
+        self._lag_s = lag_s
         self._frame, self._stamp_s, self._due = 0, 0.0, 0
         self._items: deque[tuple[int, float, T]] = deque()
 
@@ -65,7 +71,7 @@ class Delayed(Generic[T]):
 
     def _is_due(self, frame: int, timestamp_s: float) -> bool:
         frames, seconds = self._frame - frame, self._stamp_s - timestamp_s
-        return frames >= LAG and (seconds >= LAG_S or frames >= MOST_LAG)
+        return frames >= LAG and (seconds >= self._lag_s or frames >= MOST_LAG)
 
     def add(self, item: T) -> None:
         """Add what is sent with this frame."""
@@ -105,13 +111,23 @@ class LockstepMapper(RemoteMapper):
         """A process begins, to which nothing was sent."""
         self.handled = self._due = 0  # numbers of messages
         self._answers: deque[Any] = deque()
-        self._ends = Delayed[int]()  # last messages of frames
+        self._ends = Delayed[int](LAG_S)  # last messages of frames
+        self._made = Delayed[tuple[int, int]](0.0)  # keyframes and their messages
+        self._awaited, self._received = (-1, 0), -1  # keyframes with their landmarks
         self._kept: list[Any] = []
 
     def begin_frame(self, timestamp_s: float) -> None:
         """A frame begins: answers to what was sent some frames ago are due."""
         self._ends.begin_frame(timestamp_s)
         self._due = max(self._ends.take(), default=self._due)
+        self._made.begin_frame(timestamp_s)
+        self._awaited = max(self._made.take(), default=self._awaited)
+
+    def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
+        """As ``RemoteMapper.insert``; its landmarks are due before what the graph makes of them."""
+        keyframe = super().insert(frame, tracked, segment, local_ids)
+        self._made.add((keyframe.id, self.worker.sent))
+        return keyframe
 
     def end_frame(self) -> None:
         """What was sent since the last call belongs to this frame."""
@@ -121,6 +137,7 @@ class LockstepMapper(RemoteMapper):
         """Answers to all that was sent are due."""
         self._due = self.worker.sent
         self._ends.clear()
+        self._made.clear()
 
     def catch_up(self, timeout_s: float = 0.0) -> list[Any]:
         """Apply the answers that are due, once they have come; returns the other messages.
@@ -132,9 +149,11 @@ class LockstepMapper(RemoteMapper):
             return super().catch_up(timeout_s)
         others, self._kept = self._kept, []
         until_s = time.monotonic() + WAIT_S
-        while self.handled < self._due and (self._answers or self._is_to_come()):
+        while self._is_to_come():
             if self._answers:
-                others += self._apply_answers([self._answers.popleft()])
+                others += self._apply_answers([answer := self._answers.popleft()])
+                if isinstance(answer, MapChanged):
+                    self._received = max(self._received, answer.keyframe_id)
                 continue
             self._answers.extend(self.worker.receive(0.1))
             if self.worker.has_crashed:
@@ -146,8 +165,14 @@ class LockstepMapper(RemoteMapper):
         return others
 
     def _is_to_come(self) -> bool:
-        """Whether something that is due will still be answered."""
-        return not self.worker.given_up and self.worker.lacks(self.handled, self._due)
+        """Whether something is due that was answered, or will still be."""
+        keyframe_id, message = self._awaited
+        due = max(self._due, message) if self._received < keyframe_id else self._due
+        if self.handled >= due:
+            return False
+        if self._answers:
+            return True
+        return not self.worker.given_up and self.worker.lacks(self.handled, due)
 
     def send_frames(self) -> None:
         """Tell the map of the frames since the last keyframe, if there are any."""
@@ -207,7 +232,7 @@ class LockstepSegmenter(RemoteSegmenter):
     def begin(self) -> None:
         """The run begins, or begins anew."""
         self.urgent = {}
-        self._images = Delayed[ImageToSegment]()  # of which masks will be used
+        self._images = Delayed[ImageToSegment](LAG_S)  # of which masks will be used
         self._found: dict[int, Masks] = {}
 
     def begin_frame(self, timestamp_s: float) -> None:

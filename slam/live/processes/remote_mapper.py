@@ -37,7 +37,7 @@ from bmask_slam.live.messages import (
 )
 from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.processes.map_worker import MapWorker
-from bmask_slam.live.replica import apply_delta, landmarks_ahead
+from bmask_slam.live.replica import UntoldCounts, apply_delta, landmarks_ahead
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.sensing.sensor_fusion import SensorFusion
@@ -92,6 +92,7 @@ class RemoteMapper:
         self.extends, self._asked = True, False
         self._sent_frames = self._saved_keyframes = self._owned = self._unsaved = 0
         self._pending: set[int] = set()
+        self._counts = UntoldCounts()
         self.worker = MapWorker((camera, config, names), self._replacement, place)
 
     @property
@@ -133,6 +134,7 @@ class RemoteMapper:
         keyframe = add_keyframe(self.world, frame, tracked, segment)
         self.world.observe(keyframe, tracked.keypoints, tracked.landmark_ids)
         new_ids, reserved = landmarks_ahead(self.world, keyframe, self.camera, self._subpixel)
+        self._counts.are_known(new_ids[new_ids >= 0], self.world.landmarks)
         self.world.store_features(keyframe)
         self.places.add(keyframe.id, keyframe.features.descriptors)
         self._pending.add(keyframe.id)
@@ -269,7 +271,8 @@ class RemoteMapper:
         return LostKeyframe(*lost, message.history, len(self.world.landmarks))
 
     def _apply(self, message: MapChanged) -> None:
-        apply_delta(message.delta, self.world, self.history)
+        new = apply_delta(message.delta, self.world, self.history)
+        self._counts.are_known(new, self.world.landmarks)
         known_ids, present = set(self.places.keyframe_ids), self.world.keyframes
         for keyframe_id in known_ids - present.keys():
             self.places.remove(keyframe_id)
@@ -288,11 +291,7 @@ class RemoteMapper:
             self.save_state()
 
     def _visibility_counts(self) -> VisibilityCounts:
-        landmarks = self.world.landmarks
-        ids = np.flatnonzero(landmarks.visible)
-        found = VisibilityCounts(ids, landmarks.visible[ids], landmarks.found[ids])
-        landmarks.visible[:] = landmarks.found[:] = 0
-        return found
+        return VisibilityCounts(*self._counts.take(self.world.landmarks))
 
     def _unsent_history(self) -> Entries:
         entries = self.history.since(self._sent_frames)

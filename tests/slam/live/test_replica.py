@@ -9,12 +9,14 @@ import pytest
 from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.arrays import Ints, digest_rows
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.live.replica import (
     COLUMNS,
+    COUNTED,
     DeltaMaker,
+    UntoldCounts,
     apply_delta,
-    digest_rows,
     landmarks_ahead,
 )
 from bmask_slam.system import SlamSystem
@@ -88,6 +90,33 @@ def test_an_empty_delta_is_small(followed) -> None:
     assert not second.parents
     assert second.replaced_by is None
     assert len(pickle.dumps(second)) < 0.2 * len(pickle.dumps(first))
+
+
+def test_a_copy_goes_on_counting_what_frames_see(followed) -> None:
+    """A keyframe is made where few of the landmarks that are often found are found again."""
+    system, *_ = followed
+    world, copy, counts = system.mapper.world, WorldMap(), UntoldCounts()
+
+    def update() -> Ints:
+        new = apply_delta(DeltaMaker().delta(world, system.mapper.history), copy, FrameHistory())
+        counts.are_known(new, copy.landmarks)
+        return new
+
+    new = update()
+    for name in COUNTED:
+        here, there = (getattr(w.landmarks, name)[new] for w in (copy, world))
+        np.testing.assert_array_equal(here, there)
+        assert here.min() >= 1
+    assert len(counts.take(copy.landmarks)[0]) == 0
+    seen, before = new[:50], copy.landmarks.visible[new[:50]].copy()
+    copy.landmarks.visible[seen] += 3
+    copy.landmarks.found[seen] += 1
+    assert len(update()) == 0
+    ids, visible, found = counts.take(copy.landmarks)
+    np.testing.assert_array_equal(ids, seen)
+    assert set(visible) == {3} and set(found) == {1}
+    assert len(counts.take(copy.landmarks)[0]) == 0
+    np.testing.assert_array_equal(copy.landmarks.visible[seen], before + 3)
 
 
 def test_keyframes_unknown_to_the_owner_move_with_the_others(followed) -> None:

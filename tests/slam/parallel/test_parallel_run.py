@@ -22,6 +22,7 @@ from bmask_slam.labelling.awaited_masks import LAG
 from bmask_slam.live.messages import ImageToSegment, Masks, Ready
 from bmask_slam.live.processes import segmentation
 from bmask_slam.offline.runner import RunOptions, resume, run
+from bmask_slam.parallel import lockstep
 from bmask_slam.parallel.lockstep import MOST_LAG, LockstepSegmenter
 from bmask_slam.parallel.system import ParallelSystem
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
@@ -145,6 +146,25 @@ def test_masks_of_the_first_keyframe_are_used_before_the_next_frame(
     assert awaited[1] == [True]
     assert awaited[2][0] is False
     assert any(any(others[1:]) for others in awaited.values())  # later ones have time
+
+
+def test_landmarks_of_a_keyframe_come_before_what_the_graph_makes_of_them(
+    slow_office: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lockstep, "LAG_S", 1.0)
+    waits: list[bool] = []
+
+    def look(system: ParallelSystem, index: int) -> None:
+        world, ahead = system.map.world, system.map.landmarks_ahead
+        hosts = world.landmarks.host[ahead]
+        for keyframe in world.keyframes.values():
+            if index > keyframe.frame_index + LAG:
+                assert not (hosts == keyframe.id).any()
+                waits.append(system.remote.awaits(keyframe.id))
+
+    with_each_frame(monkeypatch, look)
+    run(options(slow_office, tmp_path / "run"))
+    assert any(waits) and not all(waits)
 
 
 class SlowWorker(SimpleNamespace):
