@@ -99,6 +99,8 @@ class LockstepMapper(RemoteMapper):
     Where its process has died they are waited for as well, but are not the same.
     """
 
+    counts_anew = False
+
     def __init__(
         self, camera: Camera, config: SystemConfig, names: tuple[str, ...], place: MapPlace
     ) -> None:

@@ -73,15 +73,17 @@ class RemoteMapper:
         objects: as the process told them last; None before.
         maps_saved: answers to ``SaveMap``, which their reader removes.
         extends: whether keyframes are made; else frames are only located in the map.
+        counts_anew: landmarks are counted anew from each keyframe on: fewer keyframes are made.
     """
+
+    counts_anew = True
 
     def __init__(
         self, camera: Camera, config: SystemConfig, names: tuple[str, ...], place: MapPlace
     ) -> None:
         self.world, self.history = WorldMap(), FrameHistory()
         self.camera, self._subpixel = camera, config.tracking.subpixel
-        self.places = DescriptorIndex(config.loops.index)
-        self.events = EventLog()
+        self.places, self.events = DescriptorIndex(config.loops.index), EventLog()
         self.sensors = SensorFusion(config.sensors, EventLog())  # the process reports
         self.update_ms: list[float] = []
         self.loops_closed = self.changes = self.handled = 0
@@ -91,8 +93,7 @@ class RemoteMapper:
         self.maps_saved: list[MapSaved] = []
         self.extends, self._asked = True, False
         self._sent_frames = self._saved_keyframes = self._owned = self._unsaved = 0
-        self._pending: set[int] = set()
-        self._counts = UntoldCounts()
+        self._pending, self._counts = set[int](), UntoldCounts(self.counts_anew)
         self.worker = MapWorker((camera, config, names), self._replacement, place)
 
     @property
