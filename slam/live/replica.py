@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bmask_slam.back_end.landmark_management import create_landmarks
 from bmask_slam.features.brisk import Features
@@ -185,7 +186,7 @@ class UntoldCounts:
             landmarks.visible[ids] = landmarks.found[ids] = 0
         self._known(landmarks)[:, ids] = landmarks.visible[ids], landmarks.found[ids]
 
-    def _known(self, landmarks: LandmarkTable) -> Ints:
+    def _known(self, landmarks: LandmarkTable) -> NDArray[np.int32]:
         """The counts (2, N) that the owner knows."""
         more = max(len(landmarks) - self._told.shape[1], 0)
         self._told = np.pad(self._told, ((0, 0), (0, more))) if more else self._told
