@@ -227,17 +227,15 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> In
     shared = [i for i in delta.keyframe_ids.tolist() if i in world.keyframes]
     poses = dict(zip(delta.keyframe_ids.tolist(), delta.poses, strict=True))
     if pending and shared:
-        newest = world.keyframes[shared[-1]]
-        T_old, T_new = newest.T_world_camera, poses[newest.id]
+        T_old, T_new = world.keyframes[shared[-1]].T_world_camera, poses[shared[-1]]
         for keyframe in pending:
             keyframe.T_world_camera = carried_along(keyframe.T_world_camera, T_old, T_new)
         points_world = world.landmarks.points_world
         points_world[ahead] = transform(T_new @ inverse(T_old), points_world[ahead])
     segments = dict(zip(delta.keyframe_ids.tolist(), delta.segments.tolist(), strict=True))
     kept = {i: _keyframe(i, delta, world) for i in poses}
-    for keyframe in kept.values():
-        keyframe.T_world_camera = poses[keyframe.id]
-        keyframe.segment = segments[keyframe.id]
+    for i, keyframe in kept.items():
+        keyframe.T_world_camera, keyframe.segment = poses[i], segments[i]
     world.set_keyframes(kept | {k.id: k for k in pending})
     world.next_keyframe_id = max(world.next_keyframe_id, delta.next_keyframe_id)
     world.label_views = max(world.label_views, delta.label_views)
