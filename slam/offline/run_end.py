@@ -68,10 +68,7 @@ def finish_run(run: ActiveRun) -> RunSummary:
     title = "-".join(filter(None, (run.sequence.name, options.config_name)))
     apart = save(run.system, run.folder, rows, run.reference, title)
     if options.dense:
-        from bmask_slam.dense.map_run import map_run  # noqa: PLC0415 - loads torch
-
-        with counting_bar(options.quiet) as progress:
-            map_run(map_options(run), progress)
+        _make_dense_map(run)
     if stopped_by is None:
         run.folder.complete()
     folder = run.folder.path
@@ -93,6 +90,13 @@ def finish_run(run: ActiveRun) -> RunSummary:
         + checked.warnings
         + _unwritten_checkpoints(run),
     )
+
+
+def _make_dense_map(run: ActiveRun) -> None:
+    from bmask_slam.dense.map_run import map_run  # noqa: PLC0415 - loads torch
+
+    with counting_bar(run.options.quiet) as progress:
+        map_run(map_options(run), progress)
 
 
 def _look_back(run: ActiveRun) -> None:
