@@ -29,6 +29,8 @@ from typing import Any
 from bmask_slam.graph.errors import InputError
 
 MAX_S, MAX_BYTES = 10.0, 2 << 30
+BUSY_S = 5.0
+"""That much longer a child is waited for, which may start late on a busy machine."""
 WINDOW = 8192
 REPORTED = 5
 """Faults of a reader that are kept, each of another place in the code."""
@@ -273,7 +275,7 @@ def _memory_bytes(name: str) -> int:
 def _collect(count: Count, source: int, child: int) -> str:
     """Add a child's lines to the count until it ends; how it died, "" if it did not."""
     with os.fdopen(source, "rb") as lines:
-        while select.select([lines], [], [], 3 * MAX_S)[0] and (text := lines.readline()):
+        while select.select([lines], [], [], 3 * MAX_S + BUSY_S)[0] and (text := lines.readline()):
             line = json.loads(text)
             if "broken" in line:
                 raise RuntimeError(f"the making of inputs for {count.reader}: {line['broken']}")
