@@ -63,11 +63,12 @@ def _linux_peak_mb(pid: int) -> float:
 
 
 def _children(pid: int) -> list[int]:
-    """Process ids of a process's children."""
+    """Process ids of a process's children; those seen so far, if it ends meanwhile."""
     found: list[int] = []
-    for path in Path(f"/proc/{pid}/task").glob("*/children"):
-        with suppress(OSError):
-            found += map(int, path.read_text(encoding="ascii").split())
+    with suppress(OSError):
+        for path in Path(f"/proc/{pid}/task").glob("*/children"):
+            with suppress(OSError):
+                found += map(int, path.read_text(encoding="ascii").split())
     return found
 
 

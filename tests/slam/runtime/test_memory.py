@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import platform
 import subprocess
 import sys
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -20,6 +23,16 @@ SIZE = 120_000_000
 @pytest.fixture(autouse=True)
 def _nothing_noted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "_noted_mb", [0.0])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere this process's own is told alone")
+def test_a_process_may_end_while_it_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(path: Path, pattern: str) -> Iterator[Path]:
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory", str(path))
+
+    monkeypatch.setattr(memory.Path, "glob", gone)
+    assert peak_rss_mb() > 1
+    note_peak()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere this process's own is told alone")
