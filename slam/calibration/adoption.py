@@ -42,7 +42,7 @@ class SelfCalibration:
         given: the camera before.
         camera: to run with, that one if nothing is adopted.
         text: one line for the summary and the log; "" if nothing could be said.
-        looks: how often the run was looked at in vain.
+        looks: how often the run was looked at in vain; as often as allowed: not before its end.
         settled: whether it needs no other look.
         bend_sigma: standard deviation of the distortion of depth that was adopted, in 1/m.
         covered: the same of ``Camera.covered``.
@@ -164,9 +164,11 @@ def judged(
 ) -> SelfCalibration:
     """The state after an estimate, which is of the camera given.
 
-    A parameter that does not show yet is looked for again later, unless one was adopted. Only those
-    of ``free`` may be; with a mode other than "auto" it is only told. What was adopted before stays
-    unless this estimate contradicts the camera in use or is much surer of the distortion of depth.
+    A parameter that does not show yet is looked for again later, unless one was adopted; after the
+    last frame only, if the camera has it from a run before and is right in what does show. Only
+    those of ``free`` may be adopted; with a mode other than "auto" it is only told. What was
+    adopted before stays unless this estimate contradicts the camera in use or is much surer of the
+    distortion of depth.
     """
     better = estimate.contradicts(state.camera, config) or estimate.is_surer(state, config)
     if state.adopted and not better:
@@ -188,8 +190,11 @@ def judged(
     differs = any(estimate.differs(i, config) for i in free)
     verdict = "not sure enough to be applied" if differs else "the camera keeps it"
     text = format_found(estimate, seen, verdict) if seen else UNOBSERVABLE
-    settled = bool(len(seen) == np.count_nonzero(estimate.sigmas[list(free)]) and not differs)
-    return replace(state, text=text, looks=state.looks + 1, settled=settled)
+    unseen = [i for i in free if estimate.sigmas[i] > 0 and i not in seen]
+    settled = not unseen and not differs
+    known = bool(seen) and not differs and estimate.before[unseen].all()
+    looks = config.stretches if known else state.looks + 1
+    return replace(state, text=text, looks=looks, settled=settled)
 
 
 def in_other_order(camera: Camera) -> Camera:

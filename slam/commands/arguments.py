@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, TypeAlias, get_args
 
 from bmask_slam.graph.errors import InputError
@@ -233,3 +234,12 @@ def format_summary(rows: list[Row]) -> str:
 
     told = [row for row in rows if row["name"] not in DETAILS]
     return format_table([row for row in told if not row["name"].startswith(("graph_", "camera_"))])
+
+
+def camera_lines(found: str, folder: Path | None) -> list[str]:
+    """What a run has found of its camera, and how the next run gets it."""
+    lines = [f"Camera      {found}"] if found else []
+    if folder is not None and (camera := folder / "camera.yaml").is_file():
+        option = f"--camera {quote(str(camera))}"
+        lines.append(f"            {option}: for the next recording of this camera")
+    return lines

@@ -20,6 +20,7 @@ from bmask_slam.commands.arguments import (
     add_view_arguments,
     asks_for_map,
     bag_topics,
+    camera_lines,
     chosen_config,
     format_summary,
     print_result,
@@ -288,9 +289,7 @@ def _workstation_of(arguments: argparse.Namespace) -> Workstation | None:
 
 
 def _summary(slam: LiveSlam, source: Source) -> str:
-    lines = [format_summary(slam.rows), ""]
-    if slam.calibration:
-        lines.append(f"Camera      {slam.calibration}")
+    lines = [format_summary(slam.rows), "", *camera_lines(slam.calibration, slam.out)]
     lines.append(f"Run folder  {slam.out}")
     if slam.dense is not None:
         made_of = f"{slam.dense.points} points, {slam.dense.frames} frames besides keyframes"

@@ -18,6 +18,7 @@ from bmask_slam.commands.arguments import (
     add_topic_arguments,
     asks_for_map,
     bag_topics,
+    camera_lines,
     chosen_config,
     format_summary,
     print_result,
@@ -156,8 +157,7 @@ def _plain_summary(summary: RunSummary) -> dict[str, Any]:
 
 def _summary(summary: RunSummary) -> str:
     lines = [format_summary(summary.rows), ""]
-    if summary.calibration:
-        lines.append(f"Camera      {summary.calibration}")
+    lines += camera_lines(summary.calibration, summary.folder)
     lines += [f"Warning     {warning}" for warning in summary.warnings]
     if summary.skipped:
         lines.append(f"{summary.skipped} broken frames were skipped, see log.txt")

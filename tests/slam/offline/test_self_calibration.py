@@ -30,6 +30,7 @@ from bmask_slam.calibration.camera_check import CameraCheck
 from bmask_slam.calibration.config import BENDS, FREE, SelfCalibrationConfig, estimated_priors
 from bmask_slam.calibration.motion import twists_at
 from bmask_slam.calibration.report import parameters_named
+from bmask_slam.commands.arguments import camera_lines
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import plot
 from bmask_slam.events import EventKind
@@ -113,6 +114,19 @@ def found(late_sweep: Path, tmp_path_factory: pytest.TempPathFactory) -> RunSumm
 
 def late_options(sequence: Path, out: Path) -> RunOptions:
     return RunOptions(sequence, CONFIG, quiet=True, checkpoint_every=40, out=out, max_frames=FRAMES)
+
+
+def test_the_next_run_of_the_camera_is_told_it(
+    found: RunSummary, late_sweep: Path, quick: None, tmp_path: Path
+) -> None:
+    told, option = camera_lines(found.calibration, found.folder)
+    assert told == f"Camera      {found.calibration}"
+    path = found.folder / "camera.yaml"
+    assert option.split(": ")[0] == f"            --camera {path}"
+    done = run(replace(late_options(late_sweep, tmp_path / "next"), camera=path))
+    assert done.calibration.endswith("the camera keeps it")
+    assert "begins anew" not in (done.folder / "log.txt").read_text()
+    assert camera_lines(done.calibration, done.folder) == [f"Camera      {done.calibration}"]
 
 
 def test_a_delay_is_found_and_adopted(
@@ -550,6 +564,29 @@ def test_what_is_found_can_be_kept_in_a_checkpoint() -> None:
     camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
     state = judged(SelfCalibration(camera, camera), estimate, "auto", SelfCalibrationConfig())
     assert json.dumps([state.settled, state.looks, state.text]).startswith("[false, 1, ")
+
+
+@pytest.mark.parametrize(
+    ("delay_ms", "bend", "last"),
+    [(-15.0, 0.01, True), (-15.0, 0.0, False), (0.0, 0.01, False)],
+)
+def test_a_camera_found_before_is_looked_at_again_only_at_the_end(
+    monkeypatch: pytest.MonkeyPatch, delay_ms: float, bend: float, last: bool
+) -> None:
+    """The delay shows, -15 ms. Whether the bend that does not show is known, and the delay right.
+
+    A delay that is another one is not proved.
+    """
+    prove(monkeypatch, 1.0, 1.0)
+    before = np.zeros(18)
+    before[TIME], before[BENDS[2]] = delay_ms / 1e3, bend
+    found, sigmas = np.where(np.arange(18) == TIME, -0.015, 0.0), np.zeros(18)
+    sigmas[TIME], sigmas[BENDS[2]] = 0.0005, 0.1
+    estimate = Estimate(before, found, sigmas, None)  # type: ignore[arg-type]
+    camera, config = Camera(640, 480, 500.0, 500.0, 320.0, 240.0), SelfCalibrationConfig()
+    state = judged(SelfCalibration(camera, camera), estimate, "auto", config)
+    assert (state.looks, state.settled) == (config.stretches if last else 1, False)
+    assert SelfCalibrator(state, "auto").finished is last
 
 
 def test_an_unsure_bend_is_not_observable() -> None:
