@@ -167,7 +167,9 @@ class DeltaMaker:
 class UntoldCounts:
     """How often frames saw the landmarks of a copy (N,) since the map's owner was told."""
 
-    def __init__(self) -> None:
+    def __init__(self, anew: bool) -> None:
+        """``anew``: what was told is not kept, and a landmark that is new has no counts yet."""
+        self._anew = anew
         self._told = np.zeros((2, 0), np.int32)
 
     def take(self, landmarks: LandmarkTable) -> tuple[Ints, Ints, Ints]:
@@ -180,6 +182,8 @@ class UntoldCounts:
 
     def are_known(self, ids: Ints, landmarks: LandmarkTable) -> None:
         """The owner knows the counts of landmarks (N,) as they are."""
+        if self._anew:
+            landmarks.visible[ids] = landmarks.found[ids] = 0
         self._known(landmarks)[:, ids] = landmarks.visible[ids], landmarks.found[ids]
 
     def _known(self, landmarks: LandmarkTable) -> NDArray[np.int32]:

@@ -99,6 +99,8 @@ class LockstepMapper(RemoteMapper):
     Where its process has died they are waited for as well, but are not the same.
     """
 
+    counts_anew = False
+
     def __init__(
         self, camera: Camera, config: SystemConfig, names: tuple[str, ...], place: MapPlace
     ) -> None:
@@ -115,11 +117,6 @@ class LockstepMapper(RemoteMapper):
         self._made = Delayed[tuple[int, int]](0.0)  # keyframes and their messages
         self._awaited, self._received = (-1, 0), -1  # keyframes with their landmarks
         self._kept: list[Any] = []
-
-    @property
-    def idle(self) -> bool:
-        """Whether the process waits for work, by the answers that were due."""
-        return not self._pending
 
     def begin_frame(self, timestamp_s: float) -> None:
         """A frame begins: answers to what was sent some frames ago are due."""

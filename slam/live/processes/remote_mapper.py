@@ -37,7 +37,6 @@ from bmask_slam.live.messages import (
 )
 from bmask_slam.live.processes.map_return import MapPlace
 from bmask_slam.live.processes.map_worker import MapWorker
-from bmask_slam.live.processes.supervision import WorkSpells
 from bmask_slam.live.replica import UntoldCounts, apply_delta, landmarks_ahead
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.semantics.instances.instances import PackedMask
@@ -74,7 +73,10 @@ class RemoteMapper:
         objects: as the process told them last; None before.
         maps_saved: answers to ``SaveMap``, which their reader removes.
         extends: whether keyframes are made; else frames are only located in the map.
+        counts_anew: landmarks are counted anew from each keyframe on: fewer keyframes are made.
     """
+
+    counts_anew = True
 
     def __init__(
         self, camera: Camera, config: SystemConfig, names: tuple[str, ...], place: MapPlace
@@ -91,7 +93,7 @@ class RemoteMapper:
         self.maps_saved: list[MapSaved] = []
         self.extends, self._asked = True, False
         self._sent_frames = self._saved_keyframes = self._owned = self._unsaved = 0
-        self._pending, self._counts, self._spells = set[int](), UntoldCounts(), WorkSpells()
+        self._pending, self._counts = set[int](), UntoldCounts(self.counts_anew)
         self.worker = MapWorker((camera, config, names), self._replacement, place)
 
     @property
@@ -105,8 +107,8 @@ class RemoteMapper:
 
     @property
     def idle(self) -> bool:
-        """Whether the process is free for a keyframe: at most half of its time is for them."""
-        return self._spells.has_rested
+        """Whether the process waits for work."""
+        return not self._pending
 
     @property
     def accepts_keyframes(self) -> bool:
@@ -137,7 +139,6 @@ class RemoteMapper:
         self.world.store_features(keyframe)
         self.places.add(keyframe.id, keyframe.features.descriptors)
         self._pending.add(keyframe.id)
-        self._spells.begin()
         made = NewKeyframe(
             keyframe.id,
             frame.index,
@@ -262,10 +263,11 @@ class RemoteMapper:
         """The message in place of one of which two processes died, if it needs one."""
         if not isinstance(message, NewKeyframe):
             return None
-        lost = message.id, NO_KEYFRAME, np.eye(4)
+        parent_id, T_parent_lost = NO_KEYFRAME, np.eye(4)
         if message.reference is not None:
             parent_id, T_world_parent = message.reference
-            lost = message.id, parent_id, inverse(T_world_parent) @ message.tracked.T_world_camera
+            T_parent_lost = inverse(T_world_parent) @ message.tracked.T_world_camera
+        lost = message.id, parent_id, T_parent_lost
         self.history.hand_over(*lost)
         return LostKeyframe(*lost, message.history, len(self.world.landmarks))
 
@@ -284,8 +286,6 @@ class RemoteMapper:
         self.update_ms.append(message.update_ms)
         self.world.release_memory()
         self._pending -= set(message.delta.keyframe_ids.tolist()) | {message.keyframe_id}
-        if not self._pending:
-            self._spells.end()
         made = message.keyframe_id + 1
         if made - self._saved_keyframes >= max(SAVE_EVERY, SAVE_SHARE * len(present)):
             self._saved_keyframes = made

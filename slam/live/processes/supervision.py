@@ -48,29 +48,6 @@ class RestartPolicy:
     restarts: int = 3
 
 
-class WorkSpells:
-    """When a process worked: without pause from the first message of a spell to its last answer."""
-
-    def __init__(self) -> None:
-        self._began_s: float | None = None
-        self._ended_s = self._took_s = 0.0
-
-    def begin(self) -> None:
-        """It has something to do; nothing changes if it had before."""
-        self._began_s = time.monotonic() if self._began_s is None else self._began_s
-
-    def end(self) -> None:
-        """It has nothing to do."""
-        if self._began_s is not None:
-            self._ended_s = time.monotonic()
-            self._took_s, self._began_s = self._ended_s - self._began_s, None
-
-    @property
-    def has_rested(self) -> bool:
-        """Whether it has had nothing to do for as long as its last spell took."""
-        return self._began_s is None and time.monotonic() - self._ended_s >= self._took_s
-
-
 def late_start_text(name: str, waited_s: float) -> str:
     """The error text for a process that runs but is not ready in time."""
     return (

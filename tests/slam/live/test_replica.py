@@ -95,7 +95,7 @@ def test_an_empty_delta_is_small(followed) -> None:
 def test_a_copy_goes_on_counting_what_frames_see(followed) -> None:
     """A keyframe is made where few of the landmarks that are often found are found again."""
     system, *_ = followed
-    world, copy, counts = system.mapper.world, WorldMap(), UntoldCounts()
+    world, copy, counts = system.mapper.world, WorldMap(), UntoldCounts(anew=False)
 
     def update() -> Ints:
         new = apply_delta(DeltaMaker().delta(world, system.mapper.history), copy, FrameHistory())
@@ -117,6 +117,21 @@ def test_a_copy_goes_on_counting_what_frames_see(followed) -> None:
     assert set(visible) == {3} and set(found) == {1}
     assert len(counts.take(copy.landmarks)[0]) == 0
     np.testing.assert_array_equal(copy.landmarks.visible[seen], before + 3)
+
+
+def test_counts_that_begin_anew_are_told_as_well(followed) -> None:
+    system, *_ = followed
+    copy, counts = WorldMap(), UntoldCounts(anew=True)
+    history = system.mapper.history
+    new = apply_delta(DeltaMaker().delta(system.mapper.world, history), copy, FrameHistory())
+    counts.are_known(new, copy.landmarks)
+    assert not copy.landmarks.visible.any()
+    copy.landmarks.visible[new[:50]] += 3
+    copy.landmarks.found[new[:50]] += 1
+    ids, visible, found = counts.take(copy.landmarks)
+    np.testing.assert_array_equal(ids, new[:50])
+    assert set(visible) == {3} and set(found) == {1}
+    assert not copy.landmarks.visible.any() and not copy.landmarks.found.any()
 
 
 def test_keyframes_unknown_to_the_owner_move_with_the_others(followed) -> None:

@@ -11,7 +11,7 @@ from faults import LONG_S, Clock, wait_until
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import Ready
 from bmask_slam.live.processes import supervision
-from bmask_slam.live.processes.supervision import RestartPolicy, SupervisedWorker, WorkSpells
+from bmask_slam.live.processes.supervision import RestartPolicy, SupervisedWorker
 from bmask_slam.live.processes.worker import Failure, Worker
 
 
@@ -102,22 +102,3 @@ def test_the_processor_time_of_a_worker_is_the_systems() -> None:
     finally:
         worker.kill()
     assert worker.processor_s == 0
-
-
-def test_a_process_has_rested_once_it_was_free_for_as_long_as_it_worked(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    clock, spells = Clock(), WorkSpells()
-    monkeypatch.setattr(supervision, "time", clock)
-    assert spells.has_rested
-    spells.begin()
-    clock.pass_s(2000.0)
-    spells.begin()  # a second keyframe, while it works on the first
-    clock.pass_s(1000.0)
-    assert not spells.has_rested
-    spells.end()
-    clock.pass_s(2000.0)
-    spells.end()  # an answer to something else
-    assert not spells.has_rested
-    clock.pass_s(1001.0)
-    assert spells.has_rested
