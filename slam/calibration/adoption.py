@@ -192,7 +192,7 @@ def judged(
     text = format_found(estimate, seen, verdict) if seen else UNOBSERVABLE
     unseen = [i for i in free if estimate.sigmas[i] > 0 and i not in seen]
     settled = not unseen and not differs
-    known = bool(seen) and not differs and estimate.before[unseen].all()
+    known = mode == "auto" and bool(seen) and not differs and estimate.before[unseen].all()
     looks = config.stretches if known else state.looks + 1
     return replace(state, text=text, looks=looks, settled=settled)
 

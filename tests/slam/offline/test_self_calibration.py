@@ -567,16 +567,18 @@ def test_what_is_found_can_be_kept_in_a_checkpoint() -> None:
 
 
 @pytest.mark.parametrize(
-    ("delay_ms", "bend", "last"),
-    [(-15.0, 0.01, True), (-15.0, 0.0, False), (0.0, 0.01, False)],
+    ("delay_ms", "bend", "mode", "last"),
+    [
+        (-15.0, 0.01, "auto", True),
+        (-15.0, 0.0, "auto", False),  # the bend is not known
+        (0.0, 0.01, "auto", False),  # the delay is another one, which is not proved
+        (-15.0, 0.01, "report", False),  # there is no look at the end
+    ],
 )
 def test_a_camera_found_before_is_looked_at_again_only_at_the_end(
-    monkeypatch: pytest.MonkeyPatch, delay_ms: float, bend: float, last: bool
+    monkeypatch: pytest.MonkeyPatch, delay_ms: float, bend: float, mode: str, last: bool
 ) -> None:
-    """The delay shows, -15 ms. Whether the bend that does not show is known, and the delay right.
-
-    A delay that is another one is not proved.
-    """
+    """A delay shows, -15 ms, and the bend does not."""
     prove(monkeypatch, 1.0, 1.0)
     before = np.zeros(18)
     before[TIME], before[BENDS[2]] = delay_ms / 1e3, bend
@@ -584,9 +586,9 @@ def test_a_camera_found_before_is_looked_at_again_only_at_the_end(
     sigmas[TIME], sigmas[BENDS[2]] = 0.0005, 0.1
     estimate = Estimate(before, found, sigmas, None)  # type: ignore[arg-type]
     camera, config = Camera(640, 480, 500.0, 500.0, 320.0, 240.0), SelfCalibrationConfig()
-    state = judged(SelfCalibration(camera, camera), estimate, "auto", config)
+    state = judged(SelfCalibration(camera, camera), estimate, mode, config)
     assert (state.looks, state.settled) == (config.stretches if last else 1, False)
-    assert SelfCalibrator(state, "auto").finished is last
+    assert SelfCalibrator(state, mode).finished is last
 
 
 def test_an_unsure_bend_is_not_observable() -> None:
