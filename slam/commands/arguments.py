@@ -238,8 +238,10 @@ def format_summary(rows: list[Row]) -> str:
 
 def camera_lines(found: str, folder: Path | None) -> list[str]:
     """What a run has found of its camera, and how the next run gets it."""
+    from bmask_slam.run_folder.folder import CAMERA
+
     lines = [f"Camera      {found}"] if found else []
-    if folder is not None and (camera := folder / "camera.yaml").is_file():
+    if folder is not None and (camera := folder / CAMERA).is_file():
         option = f"--camera {quote(str(camera))}"
         lines.append(f"            {option}: for the next recording of this camera")
     return lines
