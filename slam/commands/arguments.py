@@ -65,15 +65,6 @@ def add_mesh_voxel_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mesh-voxel", dest="mesh_voxel_m", type=float, metavar="M", help=text)
 
 
-def asks_for_map(arguments: argparse.Namespace, is_made: bool) -> bool:
-    """Whether a dense map is made. Raises InputError for options of it where none is made."""
-    for flag, name in (("--mesh-voxel", "mesh_voxel_m"), ("--map-frames", "map_frames")):
-        value = getattr(arguments, name, None)
-        if value is not None and not is_made:
-            raise InputError(f"{flag} {value:g}: is for the dense map; give --map too, or omit it")
-    return is_made
-
-
 def add_topic_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the topics of a bag."""
     known = "default: those of the known cameras' drivers"

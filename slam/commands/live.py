@@ -18,7 +18,6 @@ from bmask_slam.commands.arguments import (
     add_segmenter_arguments,
     add_topic_arguments,
     add_view_arguments,
-    asks_for_map,
     bag_topics,
     camera_lines,
     chosen_config,
@@ -258,6 +257,7 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
     recording = path if path.is_dir() or is_recording_file(path) else None
     if is_bag(path):
         recording = bag_topics(arguments).of_path(path)
+    wants_frames = arguments.map or arguments.map_frames is not None
     return LiveOptions(
         full_size=arguments.full_size,
         out=arguments.out or free_run_path(f"{source.name}-live"),
@@ -266,9 +266,9 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
         view=view_options(arguments, arguments.view),
         images=recording,
         title=source.name,
-        dense=asks_for_map(arguments, arguments.map),
+        dense=arguments.map,
         mesh_voxel_m=arguments.mesh_voxel_m,
-        surface_frames=frames_a_second(arguments.map_frames) if arguments.map else None,
+        surface_frames=frames_a_second(arguments.map_frames) if wants_frames else None,
         submap_points=POINTS if ros2_of(source) is not None else 0,
         calibrate=arguments.calibrate,
         straightens=True,

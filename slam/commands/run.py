@@ -16,7 +16,6 @@ from bmask_slam.commands.arguments import (
     add_output_arguments,
     add_segmenter_arguments,
     add_topic_arguments,
-    asks_for_map,
     bag_topics,
     camera_lines,
     chosen_config,
@@ -141,7 +140,6 @@ def _run_or_resume(arguments: argparse.Namespace, chosen: ChosenConfig) -> RunSu
         return resume(arguments.resume, given)
     if not arguments.sequence:
         raise InputError("run: no sequence; give a recording, or --resume RUN")
-    asks_for_map(arguments, bool(arguments.dense))
     given |= {"config": chosen.config, "config_name": chosen.name}
     return run(RunOptions(**given, overwrite=arguments.overwrite))
 

@@ -92,6 +92,11 @@ class LiveOptions:
             object.__setattr__(self, name, given if given is None else Path(given))
         if self.calibrate not in CALIBRATE:
             raise InputError(f"--calibrate {self.calibrate}: is not one of {', '.join(CALIBRATE)}")
+        frames = self.surface_frames and f"{self.surface_frames.per_s:g}"
+        for flag, value in (("--mesh-voxel", self.mesh_voxel_m), ("--map-frames", frames)):
+            if value is not None and not self.dense:
+                said = "is for the dense map; give --map too, or omit it"
+                raise InputError(f"{flag} {value}: {said}")
 
     @property
     def origin(self) -> Origin:

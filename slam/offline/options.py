@@ -76,6 +76,11 @@ class RunOptions:
                 raise InputError(f"{_flag(option)} {value}: must be a whole number of at least 1")
         if self.calibrate not in CALIBRATE:
             raise InputError(f"--calibrate {self.calibrate}: is not one of {', '.join(CALIBRATE)}")
+        if self.mesh_voxel_m is not None and not self.dense:
+            raise InputError(
+                f"--mesh-voxel {self.mesh_voxel_m}: is for the dense map; give --map too, or omit "
+                "it"
+            )
         if self.parallel and (self.map or self.localise):
             raise InputError(
                 "--parallel: begins a map of its own; give it without "

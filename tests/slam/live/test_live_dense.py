@@ -129,3 +129,12 @@ def test_on_a_full_disk_tracking_continues_and_missing_submaps_are_reported(
 def test_dense_mapping_without_a_run_folder_is_rejected() -> None:
     with pytest.raises(InputError, match="run folder"):
         LiveSlam(CAMERA, CONFIG, LiveOptions(dense=True))
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [({"mesh_voxel_m": 0.03}, "voxel 0.03"), ({"surface_frames": FrameOptions(2)}, "frames 2")],
+)
+def test_options_of_a_dense_map_without_one_are_refused(option: dict, said: str) -> None:
+    with pytest.raises(InputError, match=f"--.*{said}: is for the dense map; give --map too"):
+        LiveOptions(**option)

@@ -97,6 +97,12 @@ def test_a_run_writes_all_documented_files(
     assert (summary.frames, summary.skipped, summary.stopped_by) == (20, 0, None)
 
 
+def test_the_size_of_a_dense_map_without_one_is_refused(sequence: Path, out: Path) -> None:
+    with pytest.raises(InputError, match=r"--mesh-voxel 0\.03: is for the dense map; give --map"):
+        fake_run(sequence, out, mesh_voxel_m=0.03)
+    assert not out.exists()
+
+
 def test_a_relative_sequence_is_recorded_by_its_absolute_path(
     sequence: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
