@@ -10,7 +10,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.calibration import CalibrationResult
-from bmask_slam.graph.calibration.model import BEND, FACTOR, NORMAL_95, PARAMETERS
+from bmask_slam.graph.calibration.model import BEND, FACTOR, NORMAL_95, OFFSET, PARAMETERS
 from bmask_slam.graph.camera import Camera
 
 UNOBSERVED, WEAK = 0.8, 0.4
@@ -27,7 +27,7 @@ CURES = {
         ("cx", "cy", "p1", "p2"), "roll the camera about its optical axis, and tilt it"
     ),
     **dict.fromkeys(("k1", "k2", "k3"), "let things pass from the image's middle to its corners"),
-    "depth_factor": "give --reference or --known-distance",
+    "depth_factor": "move farther, so that the reference or the distance tells more",
     "depth_offset_m": "look at the same things from near and far",
     "time_offset_s": "move faster, and toward and away from things",
     "rolling_shutter_s": "turn the camera faster",
@@ -217,6 +217,11 @@ def _statements(done: Calibrated) -> list[str]:
             "The depth scale is not observable: images and depths fit a world of any size equally "
             "well. It and the depth offset keep their values; with --reference or --known-distance "
             "they are estimated."
+        )
+    elif _share(done, FACTOR) > WEAK and not done.prior_sigmas[OFFSET]:
+        lines.append(
+            "The depth offset keeps its value: it and a depth scale that is not well known take "
+            "each other's part."
         )
     if done.result.body_arm_m.any():
         x, y, z = 1e3 * done.result.body_arm_m

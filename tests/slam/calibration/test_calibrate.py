@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shutil
 import signal
 from pathlib import Path
@@ -101,6 +102,20 @@ def test_a_known_distance_gives_the_scale(made: tuple[Path, Path], tmp_path: Pat
         CalibrateOptions(run, tmp_path / "c.yaml", known_distance=known, anchor_sigma_m=1e-3)
     )
     assert done.camera.depth_scale == pytest.approx(TRUTH.depth_scale, rel=0.005)
+
+
+def test_a_distance_that_says_little_of_the_scale_leaves_the_depth_offset(
+    made: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """It moved by as much as an uncertain scale asked for."""
+    known = (0.1, 1.5, 0.5)
+    loose = CalibrateOptions(made[1], tmp_path / "c.yaml", known_distance=known, anchor_sigma_m=0.1)
+    done = calibrate_run(loose)
+    text = format_calibration(done)
+    assert done.camera.depth_offset_m == WRONG.depth_offset_m
+    assert done.camera.depth_scale != WRONG.depth_scale
+    assert "The depth offset keeps its value" in text
+    assert re.search("depth scale: (not|only weakly) observable.* move farther", text)
 
 
 def test_a_broken_depth_image_beside_a_keyframe_only_lacks_its_rate(
