@@ -202,6 +202,12 @@ def test_what_the_run_was_started_without_is_said_in_words(begun: Path, refused)
     refused(f"--mesh-voxel: {said} --mesh-voxel; omit it", {"mesh_voxel_m": 0.03})
 
 
+def test_a_checkpoint_with_the_size_of_a_map_that_is_not_made_is_resumed(sequence: Path) -> None:
+    """Such options were ignored once."""
+    recorded = RunOptions(sequence).recorded() | {"mesh_voxel_m": 0.03}
+    assert RunOptions.from_recorded(recorded, SystemConfig(), Path("run")).mesh_voxel_m is None
+
+
 @pytest.mark.parametrize("segmenter", [SystemConfig().semantics.segmenter.name, "truth"])
 def test_another_segmenter_is_refused_also_the_default(
     sequence: Path, tmp_path: Path, capsys, segmenter: str
