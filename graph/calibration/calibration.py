@@ -30,8 +30,9 @@ from bmask_slam.graph.calibration.problem import (
     anchor_terms,
     body_arm,
     prior_residuals,
+    transform_each,
 )
-from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.geometry import inverse, se3_exp
 
 MIN_NOISE_SCALE = 0.02
 MEDIAN_CHI2_1DOF, MEDIAN_CHI2_2DOF = 0.455, 1.386
@@ -118,7 +119,7 @@ def _descend(
     for _ in range(config.steps):
         step = _step(problem, state, scales, damping)
         while True:
-            moved = _moved(state, *step) if step else state
+            moved = _moved(problem, state, *step) if step else state
             new_cost = _cost(problem, moved, scales)
             if step and new_cost <= cost:
                 break
@@ -147,10 +148,27 @@ def _step(
 
 
 def _moved(
-    state: CalibrationState, poses: Array, points: Array, calibration: Array
+    problem: CalibrationProblem,
+    state: CalibrationState,
+    poses: Array,
+    points: Array,
+    calibration: Array,
 ) -> CalibrationState:
+    """The state after a step, exact where it turns the world, which only anchors hold.
+
+    With them a point moves with the keyframe that sees it first, and its own step is what is left.
+    """
+    moved = state.poses @ se3_exp(poses)
+    if problem.anchors is None:
+        return CalibrationState(moved, state.points + points, state.calibration + calibration)
+    landmarks, first = np.unique(problem.views.landmarks, return_index=True)
+    k = np.zeros(len(state.points), np.int64)
+    k[landmarks] = problem.views.keyframes[first]
+    seen = transform_each(inverse(state.poses[k]), state.points)
+    own = (points[:, None] @ state.poses[k, :3, :3])[:, 0]
+    own -= np.cross(poses[k, :3], seen) + poses[k, 3:]
     return CalibrationState(
-        state.poses @ se3_exp(poses), state.points + points, state.calibration + calibration
+        moved, transform_each(moved[k], seen + own), state.calibration + calibration
     )
 
 

@@ -9,7 +9,7 @@ import pytest
 from calibration_scene import PRIORS, TRUTH, make_problem
 
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.calibration.calibration import calibrate
+from bmask_slam.graph.calibration.calibration import _moved, calibrate
 from bmask_slam.graph.calibration.covariance import _clustered_variance
 from bmask_slam.graph.calibration.equations import normal_equations
 from bmask_slam.graph.calibration.model import (
@@ -20,6 +20,7 @@ from bmask_slam.graph.calibration.model import (
     SHUTTER,
     TIME,
     linearise,
+    residuals_of,
 )
 from bmask_slam.graph.calibration.problem import (
     Anchors,
@@ -27,7 +28,7 @@ from bmask_slam.graph.calibration.problem import (
     CalibrationState,
     anchor_terms,
 )
-from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 
 START = TRUTH + np.array(
     [15, -12, 6, -6, -0.05, 0.08, -0.001, 0.002, 0, 0.03, -0.012, -0.010, 0.005, *-TRUTH[13:]]
@@ -152,6 +153,20 @@ def test_an_anchor_on_another_body_gives_scale_and_lever_arm() -> None:
         for anchor in (on_body, anchored)
     ]
     assert sigmas[0] > 1.05 * sigmas[1]
+
+
+def test_a_step_that_turns_the_whole_world_changes_no_view() -> None:
+    """Else far from the origin only small ones lower the cost, and the scale creeps."""
+    problem, poses, _ = make_problem(start=START)
+    problem = on_body(problem, poses, 0.01)
+    before = CalibrationState(poses, problem.points_world, problem.calibration)
+    turn = np.array([0.1, -0.2, 0.15, 1.0, 2.0, -1.0])
+    steps = se3_log(inverse(poses) @ se3_exp(turn) @ poses)
+    points = np.cross(turn[:3], before.points) + turn[3:]
+    after = _moved(problem, before, steps, points, np.zeros(len(PARAMETERS)))
+    assert np.linalg.norm(after.points - before.points, axis=1).min() > 0.5
+    residuals = (residuals_of(problem.views, *state.values) for state in (before, after))
+    np.testing.assert_allclose(*residuals, atol=1e-6)
 
 
 def test_derivatives_of_body_positions_at_the_best_lever_arm() -> None:
