@@ -10,7 +10,13 @@ import numpy as np
 
 from bmask_slam.calibration.config import CalibrationPriors
 from bmask_slam.calibration.motion import landmark_motion
-from bmask_slam.calibration.report import WEAK, Calibrated, format_calibration, parameters_named
+from bmask_slam.calibration.report import (
+    WEAK,
+    Calibrated,
+    format_calibration,
+    parameters_named,
+    posterior_share,
+)
 from bmask_slam.calibration.views import SequenceDepths, connected_views, make_views
 from bmask_slam.evaluation.ate_rpe import clock_of
 from bmask_slam.evaluation.reference import read_reference
@@ -117,7 +123,7 @@ def _solved(problem: CalibrationProblem) -> tuple[CalibrationProblem, Calibratio
     rgbd_bonn_crowd with its reference the offset comes out as -122 mm.
     """
     result, sigmas = with_rate_error(calibrate(problem)), problem.prior_sigmas
-    if sigmas[OFFSET] and np.sqrt(result.covariance[FACTOR, FACTOR]) > WEAK * sigmas[FACTOR]:
+    if sigmas[OFFSET] and posterior_share(result, sigmas, FACTOR) > WEAK:
         held = np.where(np.arange(len(sigmas)) == OFFSET, 0.0, sigmas)
         problem = dataclasses.replace(problem, prior_sigmas=held)
         result = with_rate_error(calibrate(problem))

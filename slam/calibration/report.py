@@ -196,10 +196,14 @@ def _of(camera: Camera) -> Array:
     )
 
 
+def posterior_share(result: CalibrationResult, prior_sigmas: Array, i: int) -> float:
+    """The posterior's sigma of a parameter over the prior's; 0 for a fixed one."""
+    prior = prior_sigmas[i]
+    return float(np.sqrt(result.covariance[i, i]) / prior) if prior else 0.0
+
+
 def _share(done: Calibrated, i: int) -> float:
-    """The posterior's sigma over the prior's; 0 for a fixed parameter."""
-    prior = done.prior_sigmas[i]
-    return float(done.sigmas[i] / prior) if prior else 0.0
+    return posterior_share(done.result, done.prior_sigmas, i)
 
 
 def _verdict(done: Calibrated, i: int) -> str:

@@ -108,7 +108,7 @@ class RunOptions:
         """The options of ``recorded`` values. Raises KeyError or TypeError for others."""
         found = {name: (_ADDED | dict(recorded))[name] for name in _RECORDED}
         if not found["dense"]:
-            found["mesh_voxel_m"] = None  # once it was ignored there
+            found["mesh_voxel_m"] = None  # it was ignored where no map is made
         paths = {name: Path(found[name]) for name in _PATHS if found[name]}
         return cls(**{**found, **paths}, config=config, out=out.absolute())
 
