@@ -50,6 +50,8 @@ def answers(office: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
         "optimise": ["optimise", run, "--out", str(folder / "better"), "--quiet"],
         "export": ["export", run, "--format", "g2o", "--out", str(folder / "run.g2o")],
         "info": ["info", sequence, "--json"],
+        "live": ["live", sequence, "--segmenter", "none", "--out", str(folder / "live"), "--quiet"],
+        "live --map-frames": ["live", sequence, "--map-frames", "3", "--out", f"{run}3"],
         "run light": ["run", sequence, "--out", str(folder / "light"), "--quiet"],
         "run --map": ["run", sequence, "--segmenter", "none", "--map", "--out", f"{run}2"],
         "map": ["map", run],
@@ -74,11 +76,19 @@ def test_the_command_line_loads_no_heavy_library(answers: dict[str, list]) -> No
     assert answers["import"] == []
 
 
-@pytest.mark.parametrize("name", ["run", "evaluate", "optimise", "export", "info"])
+@pytest.mark.parametrize("name", ["run", "live", "evaluate", "optimise", "export", "info"])
 def test_the_core_needs_no_extra(answers: dict[str, list], name: str) -> None:
     status, output, errors = answers[name]
     assert status == 0, errors
     assert output
+
+
+def test_an_option_of_a_dense_map_that_is_not_made_asks_for_no_extra(
+    answers: dict[str, list],
+) -> None:
+    status, _, errors = answers["live --map-frames"]
+    assert status == 1
+    assert "--map-frames 3: is for the dense map; give --map too" in errors
 
 
 @pytest.mark.parametrize(

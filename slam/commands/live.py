@@ -257,7 +257,6 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
     recording = path if path.is_dir() or is_recording_file(path) else None
     if is_bag(path):
         recording = bag_topics(arguments).of_path(path)
-    wants_frames = arguments.map or arguments.map_frames is not None
     return LiveOptions(
         full_size=arguments.full_size,
         out=arguments.out or free_run_path(f"{source.name}-live"),
@@ -268,7 +267,7 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
         title=source.name,
         dense=arguments.map,
         mesh_voxel_m=arguments.mesh_voxel_m,
-        surface_frames=frames_a_second(arguments.map_frames) if wants_frames else None,
+        surface_frames=frames_a_second(arguments.map_frames, arguments.map),
         submap_points=POINTS if ros2_of(source) is not None else 0,
         calibrate=arguments.calibrate,
         straightens=True,

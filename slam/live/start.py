@@ -95,8 +95,7 @@ class LiveOptions:
         frames = self.surface_frames and f"{self.surface_frames.per_s:g}"
         for flag, value in (("--mesh-voxel", self.mesh_voxel_m), ("--map-frames", frames)):
             if value is not None and not self.dense:
-                said = "is for the dense map; give --map too, or omit it"
-                raise InputError(f"{flag} {value}: {said}")
+                raise _without_map(flag, value)
 
     @property
     def origin(self) -> Origin:
@@ -132,8 +131,19 @@ def start_calibration(
     )
 
 
-def frames_a_second(most: float | None) -> FrameOptions:
-    """At most so many frames for the dense map's surface. Raises InputError: it is negative."""
+def _without_map(flag: str, value: object) -> InputError:
+    return InputError(f"{flag} {value}: is for the dense map; give --map too, or omit it")
+
+
+def frames_a_second(most: float | None, dense: bool) -> FrameOptions | None:
+    """At most so many frames for the surface of a dense map, if one is made.
+
+    Raises InputError: the number is negative, or given without a map.
+    """
+    if not dense:
+        if most is not None:
+            raise _without_map("--map-frames", f"{most:g}")
+        return None
     from bmask_slam.dense.growing.frames import FrameOptions  # noqa: PLC0415 - loads torch
 
     if most is None:

@@ -9,7 +9,6 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Bytes, Floats
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import make_pose, transform
-from bmask_slam.mapping.products.floor_plan import floor_height
 from bmask_slam.mapping.products.occupancy import (
     OccupancyGrid,
     VoxelCarver,
@@ -98,6 +97,8 @@ class LiveGrid:
         heights = [
             transform(T @ poses[n], s.points[::10].astype(float))[:, 2] for n, s in submaps.items()
         ]
+        from bmask_slam.mapping.products.floor_plan import floor_height  # noqa: PLC0415 - numba
+
         return floor_height(np.concatenate(heights))
 
     def _has_moved(self, submap: _Submap, T: Array) -> bool:
