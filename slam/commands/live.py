@@ -39,7 +39,6 @@ TEXT = "track a source of frames as they come"
 MORE = """\
 Tracking is here; the map with its graph and loops, segmentation and the dense map have processes
 of their own. The run folder is that of `run`, with health.json, which is rewritten every second."""
-
 WORKSTATION = """\
 Has the map and makes the masks for robots that run `bmask-slam live SOURCE --workstation HOST`.
 Only who knows the token is served, and can then run code here. What is sent is not encrypted."""
@@ -165,6 +164,9 @@ def _sensor_topics(arguments: argparse.Namespace) -> dict[str, str]:
 
 
 def _live(arguments: argparse.Namespace) -> int:
+    from bmask_slam.parallel.loading_ahead import load_workers
+
+    load_workers()  # before what follows is imported
     from bmask_slam.live.sources.opening import open_source
 
     with closing(open_source(arguments.source, source_options(arguments))) as source:

@@ -107,7 +107,22 @@ def _add_map_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _load_ahead(arguments: argparse.Namespace) -> None:
+    """Let what other processes of the run need be loaded meanwhile, where that is known by now."""
+    from bmask_slam.parallel.loading_ahead import load_network, load_workers
+
+    if arguments.parallel:
+        load_workers()
+        return
+    given = [arguments.segmenter or "light", *arguments.set]
+    is_light = given[0] == "light" and not any("segmenter" in text for text in given)
+    if is_light and arguments.sequence and not (arguments.config or arguments.localise):
+        load_network()
+
+
 def _run(arguments: argparse.Namespace) -> int:
+    if not arguments.print_config:
+        _load_ahead(arguments)
     from bmask_slam.config.configuration import dump
 
     chosen = chosen_config(arguments)

@@ -92,14 +92,24 @@ class ForkServer:
         process = ForkedProcess(self.close, read_end)
         passed = [write_end]
         try:
-            passed.append(_in_memory(pickle.dumps(start)))
             for number in STANDARD_STREAMS:
                 passed.append(copy_of_stream(number))
-            socket.send_fds(self._control, [b"\0"], [*passed, *descriptors])
+            self._ask(start, [*passed, *descriptors])
         finally:
             for number in passed:
                 os.close(number)
         return process
+
+    def load(self, modules: Sequence[str]) -> None:
+        """Ask it to load modules; returns at once. Raises OSError if it has ended."""
+        self._ask(tuple(modules), [])
+
+    def _ask(self, request: Start | tuple[str, ...], descriptors: Sequence[int]) -> None:
+        asked = _in_memory(pickle.dumps(request))
+        try:
+            socket.send_fds(self._control, [b"\0"], [asked, *descriptors])
+        finally:
+            os.close(asked)
 
 
 class _Shared:
@@ -112,13 +122,28 @@ class _Shared:
 def start_forked(start: Start, descriptors: Sequence[int]) -> ForkedProcess:
     """Start a process by this process's one server, which is started when it is first needed."""
     with _Shared.lock:
-        if _Shared.server is not None:
-            if _Shared.server.is_running:
-                with suppress(OSError):  # it ends just now
-                    return _Shared.server.start(start, descriptors)
-            _Shared.server.close()
-        _Shared.server = ForkServer(start.environment)
-        return _Shared.server.start(start, descriptors)
+        try:
+            return _running_server(start.environment).start(start, descriptors)
+        except OSError:  # it ends just now
+            _close_shared()
+            return _running_server(start.environment).start(start, descriptors)
+
+
+def load_ahead(modules: Sequence[str], environment: Mapping[str, str]) -> None:
+    """Let this process's server, which may begin by that, load modules; returns at once.
+
+    ``environment`` as for `ForkServer`. What fails is left to those who will need a process.
+    """
+    with _Shared.lock, suppress(OSError):
+        _running_server(environment).load(modules)
+
+
+def _running_server(environment: Mapping[str, str]) -> ForkServer:
+    """This process's server; a new one where none runs."""
+    if _Shared.server is None or not _Shared.server.is_running:
+        _close_shared()
+        _Shared.server = ForkServer(environment)
+    return _Shared.server
 
 
 def _close_shared() -> None:
@@ -176,16 +201,19 @@ def serve() -> None:
         if control.fileno() in ready:
             if (received := _receive(control)) is None:
                 return
-            _fork(*received, statuses, [control.fileno(), woken, wake])
+            request, passed = received
+            if isinstance(request, Start):
+                _load(request.loaded)
+                _fork(request, passed, statuses, [control.fileno(), woken, wake])
+            else:
+                _load(*request)
 
 
 def _fork(
     start: Start, passed: Sequence[int], statuses: dict[int, int], own: Sequence[int]
 ) -> None:
-    """Load what is asked for, fork, and tell the owner the new process's id."""
+    """Fork, and tell the owner the new process's id."""
     status, *inherited = passed
-    with suppress(Exception):  # the process will report it
-        importlib.import_module(start.loaded)
     gc.freeze()  # the collector leaves alone what all processes share
     try:
         pid = os.fork()
@@ -206,14 +234,21 @@ def _fork(
         os.close(number)
 
 
-def _receive(control: socket.socket) -> tuple[Start, list[int]] | None:
-    """The next request and its descriptors; None once the owner has ended."""
+def _load(*modules: str) -> None:
+    """Load modules; the processes will report those that cannot be."""
+    for module in modules:
+        with suppress(Exception):
+            importlib.import_module(module)
+
+
+def _receive(control: socket.socket) -> tuple[Start | tuple[str, ...], list[int]] | None:
+    """The next request, a process or modules, and its descriptors; None: the owner has ended."""
     said, passed, _, _ = socket.recv_fds(control, 1, MAX_PASSED)
     if not said:
         return None
-    status, asked, *inherited = passed
+    asked, *others = passed
     with os.fdopen(asked, "rb") as file:
-        return pickle.load(file), [status, *inherited]  # nosec B301 # from the owner
+        return pickle.load(file), others  # nosec B301 # from the owner
 
 
 def _report_ended(statuses: dict[int, int]) -> None:

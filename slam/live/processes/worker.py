@@ -197,9 +197,19 @@ class Worker:
         self._channel.close()
 
 
+def load_ahead(*modules: str) -> None:
+    """Let modules of workers that will be started be loaded meanwhile, where they are forked."""
+    if fork_server.IS_SUPPORTED:
+        fork_server.load_ahead(modules, _environment())
+
+
+def _environment() -> dict[str, str]:
+    return os.environ | ONE_THREAD | safe_import_path()
+
+
 def _started(target: str, descriptors: list[int]) -> ForkedProcess | subprocess.Popen[bytes]:
     """The process that serves a target with these descriptors."""
-    environment = os.environ | ONE_THREAD | safe_import_path()
+    environment = _environment()
     if fork_server.IS_SUPPORTED:
         module = target.partition(":")[0]
         is_own = module.startswith(f"{__name__.partition('.')[0]}.")

@@ -23,6 +23,7 @@ from bmask_slam.runtime.fork_server import (
     IS_SUPPORTED,
     ForkServer,
     Start,
+    load_ahead,
     server_pid,
     start_forked,
 )
@@ -61,6 +62,10 @@ def says_where_it_is(pipe: int) -> None:
 
 def says_whose_heap(pipe: int) -> None:
     os.write(pipe, str(thread_uses_main_heap()).encode())
+
+
+def says_who_loaded(pipe: int) -> None:
+    os.write(pipe, str(sys.modules["noted"].loaded_by).encode())
 
 
 def exits_with_3(pipe: int) -> None:
@@ -267,6 +272,22 @@ def test_a_replaced_server_leaves_no_files(tmp_path: Path) -> None:
         os.kill(pid, signal.SIGKILL)
         wait_until(lambda pid=pid: not running([pid]))
     assert counts[1] == counts[2]
+
+
+def test_modules_are_loaded_ahead(tmp_path: Path) -> None:
+    """By the server that processes are forked from; one that is not there keeps nobody."""
+    (tmp_path / "noted.py").write_text("import os; loaded_by = os.getpid()")
+    paths = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    if (before := server_pid()) is not None:
+        os.kill(before, signal.SIGKILL)
+        wait_until(lambda: not running([before]))
+    load_ahead(["no_such_module", "noted"], os.environ | {"PYTHONPATH": paths})
+    read_end, write_end = os.pipe()
+    process = start_forked(start_of("says_who_loaded", tmp_path), [write_end])
+    os.close(write_end)
+    with os.fdopen(read_end) as pipe:
+        assert pipe.read() == str(server_pid())
+    assert process.wait(LONG_S) == 0
 
 
 def test_a_killed_server_is_replaced(tmp_path: Path) -> None:
