@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Ints, Mask, no_ids
+from bmask_slam.graph.arrays import Array, Ints, Mask, distinct, no_ids
 from bmask_slam.graph.factors.graph_update import (
     PARTIAL,
     Observations,
@@ -297,4 +297,4 @@ def _discard(index: dict[int, dict[int, int]], first: int, second: int) -> None:
 
 
 def _rows_of(index: dict[int, dict[int, int]], ids: Iterable[int]) -> Ints:
-    return np.unique(np.array([r for i in ids for r in index.get(i, {}).values()], np.int64))
+    return distinct(np.array([r for i in ids for r in index.get(i, {}).values()], np.int64))

@@ -8,12 +8,10 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import SPARSE, Array, Ints, distinct, numbered
 from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 
-SPARSE = 10
-"""Landmarks are numbered anew where they have more than so many ids for each observation."""
 Edges = Sequence[tuple[int, ...]]
 """Keyframe ids of pose factors: one for a prior, two for a relative pose."""
 
@@ -31,7 +29,7 @@ def constrained_landmarks(
     keyframe and any other: at least half of the largest angle between any two.
     """
     stereo = np.isfinite(observations.measurements[:, 2])
-    by_stereo = np.unique(observations.landmark_ids[stereo])
+    by_stereo = distinct(observations.landmark_ids[stereo])
     rows = np.flatnonzero(~np.isin(observations.landmark_ids, by_stereo))
     if not len(rows):
         return by_stereo
@@ -44,7 +42,7 @@ def constrained_landmarks(
     between = np.linalg.norm(np.cross(rays, rays[first][group]), axis=1)
     angle_rad = np.arctan2(between, np.sum(rays * rays[first][group], axis=1))
     widest_rad = np.maximum.reduceat(angle_rad, first)
-    return np.union1d(by_stereo, ids[widest_rad >= np.radians(min_parallax_deg)])
+    return np.sort(np.concatenate([by_stereo, ids[widest_rad >= np.radians(min_parallax_deg)]]))
 
 
 def loose_keyframes(
@@ -64,7 +62,7 @@ def loose_keyframes(
     observation.
     """
     keyframe = np.searchsorted(ids, observations.keyframe_ids)
-    names, landmark = np.unique(observations.landmark_ids, return_inverse=True)
+    names, landmark = numbered(observations.landmark_ids)
     stereo = np.isfinite(observations.measurements[:, 2])
     places = [np.searchsorted(ids, edge) for edge in edges]
     pairs = np.array([place for place in places if len(place) == 2], np.int64).reshape(-1, 2)
@@ -109,7 +107,7 @@ def firm_components(ids: Ints, observations: Observations, edges: Edges, minimum
 
 def component_labels(ids: Ints, observations: Observations, edges: Edges) -> Ints:
     """The number (K,) of the connected component that each of the sorted ids is in."""
-    names, landmark = np.unique(observations.landmark_ids, return_inverse=True)
+    names, landmark = numbered(observations.landmark_ids)
     pairs = np.array([edge for edge in edges if len(edge) == 2], np.int64).reshape(-1, 2)
     starts = np.searchsorted(ids, np.concatenate([observations.keyframe_ids, pairs[:, 0]]))
     ends = np.concatenate([len(ids) + landmark, np.searchsorted(ids, pairs[:, 1])])

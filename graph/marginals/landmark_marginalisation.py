@@ -25,7 +25,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Ints, Mask
+from bmask_slam.graph.arrays import Ints, Mask, distinct
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import NO_SLOT, FactorTables, ValueTable, ids_array
 from bmask_slam.graph.factors.graph_update import (
@@ -62,7 +62,7 @@ def marginalise_landmarks(
     """Replace all factors of these landmarks; ids that are not in the graph are ignored."""
     table, marginalised = tables.observations, tables.marginalised
     marginaliser = _Marginaliser(tables, camera, config)
-    ids = np.intersect1d(ids, tables.landmarks.ids)
+    ids = distinct(ids[tables.landmarks.contains(ids)])
     rows = table.rows_of_landmarks(ids.tolist())
     if not len(rows):
         return marginaliser.done

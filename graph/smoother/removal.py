@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Ints, no_ids
-from bmask_slam.graph.factors.factor_tables import NO_SLOT, FactorTables, ids_array
+from bmask_slam.graph.arrays import Ints, distinct, no_ids
+from bmask_slam.graph.factors.factor_tables import NO_SLOT, FactorTables, ValueTable, ids_array
 from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose, RelativePoseName
 from bmask_slam.graph.factors.observability import constrained_landmarks, firm_components
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
@@ -107,8 +107,8 @@ def remove(update: GraphUpdate, tables: FactorTables, config: SmootherConfig) ->
 
 def _plan(update: GraphUpdate, tables: FactorTables, config: SmootherConfig) -> _Plan:
     table = tables.observations
-    keyframes = np.intersect1d(update.remove_keyframes, tables.keyframes.ids)
-    landmarks = np.intersect1d(update.remove_landmarks, tables.landmarks.ids)
+    keyframes = _present(update.remove_keyframes, tables.keyframes)
+    landmarks = _present(update.remove_landmarks, tables.landmarks)
     numbers = sorted(
         {
             *_numbers_of(update.remove_relative_poses, tables),
@@ -125,6 +125,11 @@ def _plan(update: GraphUpdate, tables: FactorTables, config: SmootherConfig) -> 
     rows = np.union1d(rows, table.rows_of_landmarks(dropped.tolist()))
     loose = _left_loose(rows, keyframes, numbers, tables, config)
     return _Plan(np.union1d(landmarks, dropped), keyframes, numbers, rows, dropped, loose)
+
+
+def _present(ids: Ints, table: ValueTable) -> Ints:
+    """The ids that a table has, ascending."""
+    return distinct(ids[table.contains(ids)])
 
 
 def _numbers_of(names: Iterable[RelativePoseName], tables: FactorTables) -> list[int]:

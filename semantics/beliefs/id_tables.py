@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Ints, Mask
+from bmask_slam.graph.arrays import Ints, Mask, distinct
 
 
 class IdTables:
@@ -57,7 +57,7 @@ class IdTables:
 
     def _rows(self, ids: Ints) -> Ints:
         """Rows (N,) of ids (N,), which may repeat; those that have none get one of zeros."""
-        new = np.unique(ids[~self._found(ids)[0]])
+        new = distinct(ids[~self._found(ids)[0]])
         if len(new):
             at = np.searchsorted(self._ids, new)
             self._ids = np.insert(self._ids, at, new)

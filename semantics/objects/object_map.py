@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask, step_of
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask, numbered, step_of
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.geometry import inverse, transform
@@ -151,7 +151,7 @@ class ObjectMap:
         all_points = transform(inverse(view.T_world_camera), points_world)
         inside, pixels = self._inside(all_points)
         owners, points = all_owners[inside], all_points[inside]
-        ids, columns = np.unique(owners, return_inverse=True)
+        ids, columns = numbered(owners)
         reach_m = config.reach_m(found.points_camera[:, 2])
         hit = points_on_objects(found.points_camera, points, columns, reach_m)
         sizes = np.bincount(found.owners, minlength=len(found))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, numbered
 from bmask_slam.graph.geometry import transform
 
 _GOLDEN = 0.6180339887
@@ -71,7 +71,7 @@ class ObjectPoints:
     def in_world(self, poses: dict[int, Array]) -> tuple[Ints, Array]:
         """Objects (N,) and world points (N, 3) of the rows whose keyframe has a pose."""
         rows = self.rows(poses)
-        anchors, where = np.unique(self._anchors[rows], return_inverse=True)
+        anchors, where = numbered(self._anchors[rows])
         T_world_anchor = np.array([poses[k] for k in anchors.tolist()]).reshape(-1, 4, 4)
         points = self._points[rows].astype(float)
         moved = transform(T_world_anchor[where], points[:, None])[:, 0]
@@ -80,7 +80,7 @@ class ObjectPoints:
     def rays_in_world(self, poses: dict[int, Array]) -> Array:
         """Displacement (N, 3) of the same rows by an error of z^2 m in the depth z."""
         rows = self.rows(poses)
-        anchors, where = np.unique(self._anchors[rows], return_inverse=True)
+        anchors, where = numbered(self._anchors[rows])
         R_world_anchor = np.array([poses[k][:3, :3] for k in anchors.tolist()]).reshape(-1, 3, 3)
         points = self._points[rows].astype(float)
         turned = np.einsum("nij,nj->ni", R_world_anchor[where], points)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, distinct
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested, part
@@ -124,8 +124,8 @@ class LabelledMap:
         points of objects relative to a culled keyframe are moved to its parent.
         """
         landmarks, keyframes = self._map.world.landmarks, self._map.world.keyframes
-        known = np.union1d(self.labels.known(), self.objects.points.landmarks())
-        known = np.union1d(known, self.surfaces.known())
+        points = self.objects.points.landmarks()
+        known = distinct(np.concatenate([self.labels.known(), points, self.surfaces.known()]))
         removed = known[~landmarks.in_map[known]]
         if len(removed):
             parents = landmarks.current(removed)

@@ -9,7 +9,7 @@ import numpy as np
 
 from bmask_slam.features.brisk import Features
 from bmask_slam.features.patch_alignment import SubpixelConfig, cut_patches
-from bmask_slam.graph.arrays import Array, Arrays, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Ints, distinct
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.disk_arrays import DiskRecords
 from bmask_slam.graph.geometry import step_lengths, transform
@@ -72,7 +72,7 @@ class WorldMap:
 
     def observing(self, landmark_ids: Ints) -> list[Keyframe]:
         """The keyframes that observe any of these landmarks, oldest first."""
-        found = np.unique(self._observers.of(np.unique(landmark_ids)))
+        found = np.unique(self._observers.of(distinct(landmark_ids)))
         return [self.keyframes[k] for k in found.tolist()]
 
     def _index(self, keyframe: Keyframe) -> None:
@@ -267,7 +267,7 @@ class WorldMap:
 
         The minimum is at least 1; of keyframes that share as many the newest comes first.
         """
-        shared = np.bincount(self._observers.of(np.unique(landmark_ids)))
+        shared = np.bincount(self._observers.of(distinct(landmark_ids)))
         strong = np.flatnonzero(shared >= minimum)[::-1]
         strong = strong[np.argsort(-shared[strong], kind="stable")]
         return [(int(shared[k]), self.keyframes[k]) for k in strong.tolist()]
