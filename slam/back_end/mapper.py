@@ -151,9 +151,9 @@ class Mapper:
 
     def close(self, confirmed: list[LoopConstraint]) -> list[LoopConstraint]:
         """Close loops that confirm each other; returns those that fit the graph."""
-        self.change_graph(relative_poses=self.loops.relative_poses(confirmed))
-        believed = self.loops.is_strong(confirmed)
-        self.loops.closed |= {loop.ends: believed for loop in confirmed}
+        added = self.loops.relative_poses(confirmed, self.world)
+        self.change_graph(relative_poses=added)
+        self.loops.closed |= {pose.keyframe_ids: pose.robust is None for pose in added}
         refuted = self._remove_wrong_loops({loop.ends for loop in confirmed})
         kept = [loop for loop in confirmed if loop.ends not in refuted]
         self.loops.waiting += [loop for loop in confirmed if loop.ends in refuted]

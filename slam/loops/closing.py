@@ -40,9 +40,9 @@ class LoopClosingConfig:
     ones are kept. A loop must not imply more drift than ``noise`` allows, and only loops whose ends
     are within ``comparable_m`` of path are compared. A loop stays while its chi-square in the graph
     is below that of ``probability``. A map with a systematic error (a wrong focal length) is
-    overconfident and would refute every loop; therefore ``strong_support`` loops from three
-    keyframes enter without a robust kernel and untested. ``fuse_keyframes`` of the new side are
-    searched for the old side's landmarks.
+    overconfident and would refute every loop; therefore ``strong_support`` loops that agree, from
+    three keyframes, enter without a robust kernel and untested. ``fuse_keyframes`` of the new side
+    are searched for the old side's landmarks.
     """
 
     enabled: bool = True
@@ -198,9 +198,9 @@ class LoopCloser:
             return []
         found, loops = loops, [*self.waiting, *loops][-self.config.waiting :]
         agreeing = self.agreeing(loops, world)
-        confirmed = agreeing if len(agreeing) >= self.config.min_support else []
-        if len({loop.keyframe_b for loop in confirmed}) < 2:
-            confirmed = []
+        keyframes = {loop.keyframe_b for loop in agreeing}
+        is_enough = len(agreeing) >= self.config.min_support and len(keyframes) > 1
+        confirmed = agreeing if is_enough else []
         self.noise.learn(confirmed, world)
         self._learn_drift(confirmed, world, paths)
         entering = {loop.ends for loop in confirmed}
@@ -222,16 +222,17 @@ class LoopCloser:
         chi2 = cycles.chi2(self.noise.ratio, self.noise.map_covariances(cycles.paths))
         return bool(np.median(chi2[cycles.first == 0]) > self.config.gate)
 
-    def is_strong(self, loops: list[LoopConstraint]) -> bool:
-        """Whether a confirmed set is trusted more than the graph."""
-        keyframes = {loop.keyframe_b for loop in loops}
-        return len(loops) >= self.config.strong_support and len(keyframes) >= 3
-
-    def relative_poses(self, loops: list[LoopConstraint]) -> tuple[RelativePose, ...]:
-        """The relative poses that a confirmed set adds to the graph."""
-        robust = None if self.is_strong(loops) else self.config.robust
+    def relative_poses(
+        self, loops: list[LoopConstraint], world: WorldMap
+    ) -> tuple[RelativePose, ...]:
+        """The relative poses that a confirmed set adds; of a strong set that agrees, no kernel."""
+        strong = self.agreeing(loops, world)
+        few = len(strong) < self.config.strong_support or len({k.keyframe_b for k in strong}) < 3
+        believed = set() if few else {k.ends for k in strong}
+        noise, robust = self.noise.covariance, self.config.robust
         return tuple(
-            RelativePose(*k.ends, k.T_a_b, self.noise.covariance(k), robust, LOOP) for k in loops
+            RelativePose(*k.ends, k.T_a_b, noise(k), None if k.ends in believed else robust, LOOP)
+            for k in loops
         )
 
     def refuted(self, errors: RelativePoseErrors, world: WorldMap) -> set[tuple[int, int]]:

@@ -160,13 +160,16 @@ def test_an_accepted_wrong_loop_is_removed_later(monkeypatch: pytest.MonkeyPatch
     assert ring.error_rad() == pytest.approx(sound.error_rad(), rel=0.01)
 
 
-def test_wrong_loops_among_a_strong_set_are_removed(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("count", "sigmas"), [(2, [0.3, 1.0]), (5, [0.5, 2.0])])
+def test_wrong_loops_among_a_strong_set_are_removed(
+    count: int, sigmas: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A strong set of loops is accepted against the path; contradictions within the set are not."""
     sound, ring = Ring(), Ring()
     right = sound.run(ONCE_ROUND)
     last = max(loop.keyframe_b for loop in right)
     rng = np.random.default_rng(5)
-    noise = rng.normal(size=(2, 6)) * [0.3, 0.3, 0.3, 1, 1, 1]
+    noise = rng.normal(size=(count, 6)) * np.repeat(sigmas, 3)
     wrong = [constraint(4 + 3 * k, last, se3_exp(xi)) for k, xi in enumerate(noise)]
     monkeypatch.setattr(ring.mapper.loops, "loops_of", lambda *_: [])
     ring.run(last)
