@@ -210,4 +210,6 @@ class ObjectPoints:
         self._covered = state.get("covered", unknown).reshape(-1, 2).copy()
         if self._covered.shape != unknown.shape or (self._covered[:, 1] < 1).any():
             raise ValueError("not how many views show each point of an object")
+        if (self._owners < 0).any():
+            raise ValueError("points of an object with a negative id")
         self._seen_s, self._landmarks = state["seen_s"], state["landmarks"]

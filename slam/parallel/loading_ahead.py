@@ -1,6 +1,6 @@
-"""Loads the modules of worker processes while a command loads its own, a second at once.
+"""Loads the modules of worker processes while a command loads its own, which saves a second.
 
-The server that workers are forked from does it; a command begins with a call, before its imports.
+The server that workers are forked from loads them; commands call this before they import anything.
 """
 
 from __future__ import annotations
