@@ -84,10 +84,9 @@ def network_labels(options: MapOptions, true: dict[str, Any]) -> dict[str, float
     shutil.copytree(options.run, copy, dirs_exist_ok=True, ignore=shutil.ignore_patterns("dense"))
     light = SegmenterOptions("light")
     summary = map_run(dataclasses.replace(options, run=copy, masks=light, plan=False))
-    known, true_labels = (
-        make_segmenter(masks, sequence).labels for masks in (light, SegmenterOptions("truth"))
-    )
-    numbers = np.array([true_labels.number(name) for name in known.names])
+    true_labels = make_segmenter(SegmenterOptions("truth"), sequence).labels
+    names = json.loads((summary.folder / "legend.json").read_text())  # things, then surfaces
+    numbers = np.array([true_labels.number(name) for name in names])
     cloud = read_ply(summary.folder / "cloud.ply")
     return label_errors({**cloud, "label": numbers[cloud["label"]]}, true)
 
