@@ -209,6 +209,8 @@ def test_a_count_of_views_that_is_not_of_the_points_is_refused() -> None:
     for covered in (np.ones(4, np.int64), np.zeros(6, np.int64)):
         with pytest.raises(ValueError, match="not how many views"):
             ObjectPoints().restore({**state, "covered": covered})
+    with pytest.raises(ValueError, match="negative id"):
+        ObjectPoints().restore({**state, "owners": -1 - state["owners"]})
     older = ObjectPoints()
     older.restore({name: array for name, array in state.items() if name != "covered"})
     assert older.covered_shares({0: np.eye(4)}).tolist() == [1.0, 1.0, 1.0]
