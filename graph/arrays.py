@@ -19,7 +19,7 @@ Bits = NDArray[np.uint64]  # binary descriptors, 64 bits a word
 Arrays = dict[str, NDArray[Any]]  # arrays by name, as a file holds them
 
 SPARSE = 10
-"""Ids are told apart by counting up to the largest where it is below so many times their number."""
+"""Ids are told apart by counting where they span less than so many times their number."""
 _ODD, _HALF = np.uint64(0x9E3779B97F4A7C15), np.uint64(32)
 
 
@@ -34,25 +34,24 @@ def no_pairs() -> Ints:
 
 
 def distinct(ids: Ints) -> Ints:
-    """Ids (N,), none negative, ascending and each once; ``np.unique`` takes three to fifty times
-    as long, since it hashes them.
-    """
-    if int(ids.max(initial=0)) < SPARSE * len(ids):
-        return np.flatnonzero(np.bincount(ids))
+    """Ids (N,), ascending and each once; ``np.unique``, which hashes them, takes longer."""
+    if not len(ids):
+        return no_ids()
+    low = int(ids.min())
+    if int(ids.max()) - low < SPARSE * len(ids):
+        return low + np.flatnonzero(np.bincount(ids - low))
     ordered = np.sort(ids)
-    return ordered[np.diff(ordered, prepend=-1) > 0]
+    return ordered[np.append(True, ordered[1:] != ordered[:-1])]
 
 
 def numbered(ids: Ints) -> tuple[Ints, Ints]:
     """The `distinct` ids of ids (N,), and of each of these its place (N,) among them."""
-    if int(ids.max(initial=0)) >= SPARSE * len(ids):
-        names, places = np.unique(ids, return_inverse=True)
-        return names, places
-    counts = np.bincount(ids)
-    names = np.flatnonzero(counts)
-    places = np.empty(len(counts), np.int64)
-    places[names] = np.arange(len(names))
-    return names, places[ids]
+    names = distinct(ids)
+    if not len(ids) or (span := int(names[-1]) - int(names[0])) >= SPARSE * len(ids):
+        return names, np.searchsorted(names, ids)
+    places = np.empty(span + 1, np.int64)
+    places[names - names[0]] = np.arange(len(names))
+    return names, places[ids - names[0]]
 
 
 def step_of(whole: int, kept: int) -> int:

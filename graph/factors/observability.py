@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from bmask_slam.graph.arrays import SPARSE, Array, Ints, distinct, numbered
+from bmask_slam.graph.arrays import Array, Ints, distinct, numbered
 from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 
@@ -118,16 +118,10 @@ def component_labels(ids: Ints, observations: Observations, edges: Edges) -> Int
 
 def shared_landmarks(ids: Ints, observations: Observations) -> csr_array:
     """How many landmarks each two of the sorted ids (K,) share: (K, K), sparse."""
-    landmark = observations.landmark_ids
-    if len(landmark):
-        landmark = landmark - landmark.min()
-    width = landmark.max(initial=0) + 1
-    if width > SPARSE * len(landmark):
-        names, landmark = np.unique(landmark, return_inverse=True)
-        width = len(names)
+    names, landmark = numbered(observations.landmark_ids)
     rows = np.searchsorted(ids, observations.keyframe_ids)
     ones = np.ones(len(rows), np.int64)
-    sees = coo_array((ones, (rows, landmark)), (len(ids), width)).tocsr()
+    sees = coo_array((ones, (rows, landmark)), (len(ids), len(names))).tocsr()
     return (sees @ sees.T).tocsr()
 
 

@@ -72,7 +72,7 @@ class WorldMap:
 
     def observing(self, landmark_ids: Ints) -> list[Keyframe]:
         """The keyframes that observe any of these landmarks, oldest first."""
-        found = np.unique(self._observers.of(distinct(landmark_ids)))
+        found = distinct(self._observers.of(distinct(landmark_ids)))
         return [self.keyframes[k] for k in found.tolist()]
 
     def _index(self, keyframe: Keyframe) -> None:

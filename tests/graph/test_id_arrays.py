@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from bmask_slam.graph.arrays import distinct, no_ids, numbered
 
 FEW = st.lists(st.integers(0, 40), max_size=200)
-FAR = st.lists(st.integers(0, 2**40), max_size=50)
+FAR = st.lists(st.integers(-(2**40), 2**40), max_size=50)
 
 
 @given(st.one_of(FEW, FAR))
